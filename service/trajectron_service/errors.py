@@ -13,7 +13,7 @@ DOMAIN = "trajectron"
 
 
 class ErrorKind(enum.Enum):
-    """What went wrong, as clients see it: the value is ``ErrorInfo.reason`` and the problem type."""
+    """What went wrong; the value is ``ErrorInfo.reason`` and the problem type."""
 
     INVALID_ARGUMENT = "INVALID_ARGUMENT"
     MALFORMED = "MALFORMED"

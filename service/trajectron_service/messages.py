@@ -133,7 +133,7 @@ class GraphNode:
 
 @dataclass(frozen=True, slots=True)
 class GraphEdge:
-    """A directed edge: what the sender means to the receiver (ages in steps, modulation in [0, 1])."""
+    """What the sender means to the receiver; ages in steps, modulation in [0, 1]."""
 
     receiver_id: str
     sender_id: str
@@ -187,7 +187,7 @@ class AgentForecast:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """A scene's futures from ``reference_time`` on; agents' samples are independent of each other."""
+    """A scene's futures from ``reference_time`` on; samples are independent between agents."""
 
     model: str
     model_hash: str

@@ -1,0 +1,1 @@
+"""Code generated from ``protos/trajectron``: the messages and services of the contract."""
