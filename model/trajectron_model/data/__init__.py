@@ -1,0 +1,1 @@
+"""Recordings of moving agents: readers, writers, benchmark splits, evaluation windows."""
