@@ -1,0 +1,52 @@
+# Everything a newcomer needs from a bare clone: Python 3.11+ and make.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+
+# The first interpreter that runs and is new enough; looked for only when installing.
+PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3 python; do \
+	$$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$name && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+ARGS ?=
+
+.PHONY: help install serve test check format protos clean
+
+help: ## show this list
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-9s %s\n", $$1, $$2}'
+
+# The stamp holds until the dependencies change; the code itself is installed editable.
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt hatchling editables
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--no-build-isolation --editable '.[service,train,dev]'
+	touch $@
+
+install: $(INSTALLED) ## create .venv and install everything at exact versions
+
+serve: $(INSTALLED) ## start the service on 127.0.0.1 (HTTP 8000, gRPC 50051); ARGS="--help" for flags
+	exec $(BIN)/trajectron serve $(ARGS)
+
+test: $(INSTALLED) ## run the tests; ARGS="-k name" for some
+	$(BIN)/python -m pytest $(ARGS)
+
+check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentation links
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/python scripts/protos.py --check
+	$(BIN)/python scripts/links.py
+
+format: $(INSTALLED) ## format the code and mend what the linter can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+protos: $(INSTALLED) ## generate the code of the contract and lint it
+	$(BIN)/python scripts/protos.py
+
+clean: ## remove the environment and every cache
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
