@@ -1,0 +1,62 @@
+"""Errors over gRPC: ``google.rpc.Status`` with its standard details (AIP-193)."""
+
+from __future__ import annotations
+
+from typing import NoReturn, TypeVar
+
+import grpc
+from google.protobuf import any_pb2, duration_pb2
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+
+from trajectron_service.errors import DOMAIN, ServiceError
+
+Request = TypeVar("Request")
+Answer = TypeVar("Answer")
+
+# Where every gRPC library looks for the details of a status.
+_DETAILS_KEY = "grpc-status-details-bin"
+
+
+def status_message(error: ServiceError) -> status_pb2.Status:
+    """An error of the core with ``ErrorInfo``, ``BadRequest`` and, if retryable, ``RetryInfo``."""
+    details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.kind.value, domain=DOMAIN)]
+    if error.violations:
+        details.append(
+            error_details_pb2.BadRequest(
+                field_violations=[
+                    error_details_pb2.BadRequest.FieldViolation(
+                        field=violation.field, description=violation.description
+                    )
+                    for violation in error.violations
+                ]
+            )
+        )
+    if error.codes.retryable:
+        delay = duration_pb2.Duration()
+        delay.FromNanoseconds(round((error.retry_after_s or 1.0) * 1e9))
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
+    return status_pb2.Status(
+        code=status_code(error).value[0],
+        message=error.message,
+        details=[_packed(detail) for detail in details],
+    )
+
+
+def status_code(error: ServiceError) -> grpc.StatusCode:
+    """The gRPC code of an error's kind."""
+    return grpc.StatusCode[error.codes.grpc]
+
+
+async def abort(
+    context: grpc.aio.ServicerContext[Request, Answer], error: ServiceError
+) -> NoReturn:
+    """Ends a call with an error's status and its details."""
+    details = status_message(error).SerializeToString()
+    await context.abort(status_code(error), error.message, ((_DETAILS_KEY, details),))
+
+
+def _packed(detail: Message) -> any_pb2.Any:
+    packed = any_pb2.Any()
+    packed.Pack(detail)
+    return packed

@@ -1,0 +1,85 @@
+"""Reads request bodies: within a limit, while the client is still there."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+from starlette.requests import ClientDisconnect, Request
+
+from trajectron_service.errors import ErrorKind, ServiceError
+from trajectron_service.http_errors import invalid_body
+from trajectron_service.http_schemas import Body
+
+B = TypeVar("B", bound=Body)
+T = TypeVar("T")
+
+
+async def read_body(request: Request, shape: type[B], limit_bytes: int) -> B:
+    """A request's body in its shape; an empty one is an empty object.
+
+    Raises:
+        ServiceError: ``TOO_LARGE`` as soon as more than ``limit_bytes`` are announced or have
+            come, ``MALFORMED`` for what is no JSON, ``INVALID_ARGUMENT`` naming the fields.
+    """
+    raw = await _read(request, limit_bytes)
+    try:
+        return shape.model_validate_json(raw or b"{}")
+    except ValidationError as error:
+        raise invalid_body(error) from None
+
+
+async def _read(request: Request, limit_bytes: int) -> bytes:
+    if request.headers.get("content-encoding", "identity") != "identity":
+        raise ServiceError(
+            ErrorKind.MALFORMED, "the body has a Content-Encoding; send it as plain JSON"
+        )
+    announced = request.headers.get("content-length", "0")
+    if announced.isdecimal() and int(announced) > limit_bytes:
+        raise _too_large(limit_bytes)
+    chunks: list[bytes] = []
+    size = 0
+    try:
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size > limit_bytes:
+                raise _too_large(limit_bytes)
+            chunks.append(chunk)
+    except ClientDisconnect:
+        raise _gone() from None
+    return b"".join(chunks)
+
+
+async def while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """The result of some work, cancelled as soon as the client hangs up.
+
+    Call it only after the body was read. Raises ``CANCELLED`` when the client has gone.
+    """
+    working = asyncio.create_task(work)
+    hanging_up = asyncio.create_task(_hang_up(request))
+    try:
+        await asyncio.wait({working, hanging_up}, return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+        raise _gone()
+    finally:
+        hanging_up.cancel()
+        working.cancel()
+
+
+async def _hang_up(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _too_large(limit_bytes: int) -> ServiceError:
+    return ServiceError(
+        ErrorKind.TOO_LARGE,
+        f"the body is larger than {limit_bytes} bytes; send fewer frames or agents at a time",
+    )
+
+
+def _gone() -> ServiceError:
+    return ServiceError(ErrorKind.CANCELLED, "the client hung up")
