@@ -51,7 +51,7 @@ class _Rows:
 
 
 def read_eth_ucy(
-    path: str | Path, *, frames_per_step: int = 10, dt_s: float = 0.4, type: str = PEDESTRIAN
+    path: str | Path, *, frames_per_step: int = 10, dt_s: float = 0.4, agent_type: str = PEDESTRIAN
 ) -> Recording:
     """A recording in the text format of ETH/UCY: frame, id, x, y, split by tabs or spaces.
 
@@ -61,14 +61,14 @@ def read_eth_ucy(
         frames_per_step: frames between two steps of the file. A frame off this grid is an
             error: the format does not say how long a frame is, so nothing is resampled here.
         dt_s: seconds between two steps.
-        type: of all agents; the format has none.
+        agent_type: of all agents; the format has none.
 
     Raises:
         DataError: as the module says, or a frame that is not on the grid.
     """
     path = Path(path)
     text, sha256 = _load(path)
-    rows = _whitespace_rows(path, text, _ETH_UCY_COLUMNS, type_column=None, only_type=type)
+    rows = _whitespace_rows(path, text, _ETH_UCY_COLUMNS, type_column=None, only_type=agent_type)
     first_frame = rows.time.min()
     steps = (rows.time - first_frame) / frames_per_step
     off_grid = np.flatnonzero(steps != np.rint(steps))
@@ -223,8 +223,8 @@ def _csv_rows(path: Path, text: str) -> _Rows:
     values: list[tuple[float, float, float]] = []
     order: list[int] | None = None
     try:
-        for cells in reader:
-            cells = [cell.strip() for cell in cells]
+        for row in reader:
+            cells = [cell.strip() for cell in row]
             if not any(cells):
                 continue
             line = reader.line_num

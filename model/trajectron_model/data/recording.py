@@ -133,7 +133,8 @@ class Recording:
 
     def frame(self, step: int) -> SceneFrame:
         """The scene at one step, as the model's ``step`` takes it."""
-        from trajectron_model.state import SceneFrame
+        # Imported here, so that recordings are read and written without loading torch.
+        from trajectron_model.state import SceneFrame  # noqa: PLC0415
 
         rows = self.rows(step, step + 1)
         agents = self.agent[rows].tolist()

@@ -37,5 +37,7 @@ def write_eth_ucy(recording: Recording, file: TextIO, *, frames_per_step: int = 
     rows = zip(
         recording.step.tolist(), recording.agent.tolist(), recording.position.tolist(), strict=True
     )
-    for step, agent, (x, y) in rows:
-        file.write(f"{step * frames_per_step}\t{agent + 1}\t{round(x, 6)}\t{round(y, 6)}\n")
+    file.writelines(
+        f"{step * frames_per_step}\t{agent + 1}\t{round(x, 6)}\t{round(y, 6)}\n"
+        for step, agent, (x, y) in rows
+    )

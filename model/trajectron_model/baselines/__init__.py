@@ -1,0 +1,1 @@
+"""Simple predictors to be judged beside the model, on the same windows."""

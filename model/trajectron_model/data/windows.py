@@ -1,0 +1,130 @@
+"""Evaluation windows: a stretch of observed steps, the steps to foretell, the agents judged.
+
+Shape letters: T observed steps, H horizon steps, A judged agents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajectron_model.data.recording import Recording
+
+if TYPE_CHECKING:
+    from trajectron_model.state import SceneFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """One window; it holds indices only and reads its recording when asked.
+
+    A predictor may look at `frames` and `history` alone: the ``observed`` steps and nothing
+    before or after them.
+
+    Attributes:
+        recording: the recording it is a window of.
+        first: the first observed step.
+        observed: number of observed steps.
+        horizon: number of steps to foretell, right after the observed ones.
+        judged: [A] agents whose forecasts are judged, indices into the recording's ids.
+    """
+
+    recording: Recording
+    first: int
+    observed: int
+    horizon: int
+    judged: NDArray[np.int64] = field(repr=False)
+
+    @property
+    def now(self) -> int:
+        """The newest observed step."""
+        return self.first + self.observed - 1
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """[A] ids of the judged agents."""
+        return tuple(self.recording.ids[agent] for agent in self.judged.tolist())
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """[A] types of the judged agents."""
+        return tuple(self.recording.types[agent] for agent in self.judged.tolist())
+
+    def frames(self) -> list[SceneFrame]:
+        """[T] the observed steps, with everyone visible in them, judged or context."""
+        return [self.recording.frame(self.first + step) for step in range(self.observed)]
+
+    def history(self) -> NDArray[np.float64]:
+        """[A, T, 2] observed positions of the judged agents, metres; NaN where absent."""
+        return self._positions(self.first, self.first + self.observed)
+
+    def future(self) -> NDArray[np.float64]:
+        """[A, H, 2] true positions of the judged agents, metres; NaN where absent."""
+        return self._positions(self.now + 1, self.now + 1 + self.horizon)
+
+    def _positions(self, first: int, last: int) -> NDArray[np.float64]:
+        rows = self.recording.rows(first, last)
+        agent = self.recording.agent[rows]
+        column = np.searchsorted(self.judged, agent)
+        known = column < len(self.judged)
+        known[known] = self.judged[column[known]] == agent[known]
+        positions = np.full((len(self.judged), last - first, 2), np.nan)
+        step = self.recording.step[rows] - first
+        positions[column[known], step[known]] = self.recording.position[rows][known]
+        return positions
+
+
+def sgan_windows(
+    recording: Recording, *, observed: int = 8, horizon: int = 12, min_agents: int = 2
+) -> list[Window]:
+    """The windows of the protocol published with Social GAN (Gupta et al., CVPR 2018).
+
+    Every ``observed + horizon`` consecutive steps, stride 1. Judged are the agents present in
+    all of them; a window counts when at least ``min_agents`` are. Everyone else visible in the
+    observed steps is context.
+
+    Returns:
+        windows by their first step; the judged agents of each ascending.
+    """
+    length = observed + horizon
+    start, agent = _stretches(recording, length)
+    order = np.lexsort((agent, start))
+    start, agent = start[order], agent[order]
+    firsts, begin = np.unique(start, return_index=True)
+    end = np.append(begin[1:], len(start))
+    windows = zip(firsts.tolist(), begin.tolist(), end.tolist(), strict=True)
+    return [
+        Window(recording, first, observed, horizon, agent[low:high])
+        for first, low, high in windows
+        if high - low >= min_agents
+    ]
+
+
+def _stretches(
+    recording: Recording, length: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Every (first step, agent) from which the agent is present in ``length`` steps on end."""
+    order = np.lexsort((recording.step, recording.agent))
+    step, agent = recording.step[order], recording.agent[order]
+    ahead = np.arange(len(step)) + length - 1
+    inside = ahead < len(step)
+    row, ahead = np.flatnonzero(inside), ahead[inside]
+    # Steps of one agent rise strictly, so they are consecutive when the ends are so far apart.
+    whole = (agent[ahead] == agent[row]) & (step[ahead] - step[row] == length - 1)
+    return step[row[whole]], agent[row[whole]]
+
+
+def batches(windows: Sequence[Window], max_agents: int) -> Iterator[Sequence[Window]]:
+    """The windows in order, in runs of at most ``max_agents`` judged agents (at least a window)."""
+    first, agents = 0, 0
+    for index, window in enumerate(windows):
+        if index > first and agents + len(window.judged) > max_agents:
+            yield windows[first:index]
+            first, agents = index, 0
+        agents += len(window.judged)
+    if first < len(windows):
+        yield windows[first:]
