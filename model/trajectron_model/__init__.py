@@ -1,0 +1,1 @@
+"""The Trajectron: probabilistic trajectories of many agents from a dynamic spatiotemporal graph."""

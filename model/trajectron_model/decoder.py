@@ -1,0 +1,186 @@
+"""The decoder: an LSTM that emits, step by step, a Gaussian mixture over the next velocity.
+
+It is fed [previous velocity; z; h_enc] (paper, "Generating Distributions of Trajectories").
+z is one of few values and h_enc does not change over the horizon, so their part of the
+gates is computed once for each agent and latent value and kept out of the loop; only the
+previous velocity and the hidden state are multiplied at every step.
+
+Velocities here are in the node's frame, in units of its type's speed scale. The mixture
+is over the change of velocity, added to the previous velocity: the same family, and a
+sensible start.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from trajectron_model.config import ModelConfig
+from trajectron_model.gmm import BivariateMixture, choose, correlated
+from trajectron_model.integration import limit_speed
+
+_CORRELATION_BOUND = 0.98
+# Rows decoded at a time when sampling: the gates of a block stay in the processor's cache.
+_BLOCK_ROWS = 1024
+
+
+class Start(NamedTuple):
+    """What a rollout begins with, a row each; the first three are sums over h_enc and z parts."""
+
+    gates: Tensor  # [R, 4 decoder_size]
+    hidden: Tensor  # [R, decoder_size]
+    cell: Tensor  # [R, decoder_size]
+    velocity: Tensor  # [R, 2] the last causal velocity, y_0
+
+
+class Decoder(nn.Module):
+    """LSTM 128 to a mixture of 16 bivariate Gaussians over velocity, autoregressive."""
+
+    def __init__(self, config: ModelConfig, encoding_size: int) -> None:
+        super().__init__()
+        size, components = config.decoder_size, config.mixture_components
+        self.size = size
+        self.components = components
+        self.recurrent = nn.Linear(2 + size, 4 * size, bias=False)  # [y_{t-1}; h] -> gates
+        self.gates_encoding = nn.Linear(encoding_size, 4 * size)
+        self.gates_latent = nn.Embedding(config.latent_values, 4 * size)
+        # h_0 and c_0 are linear in [z; h_enc].
+        self.start_encoding = nn.Linear(encoding_size, 2 * size)
+        self.start_latent = nn.Embedding(config.latent_values, 2 * size)
+        # Per component: weight logit, mean x, y, log scale x, y, correlation.
+        self.head = nn.Linear(size, 6 * components)
+        self.log_sigma_min = math.log(config.sigma_min_mps)
+        self.log_sigma_max = math.log(config.sigma_max_mps)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        nn.init.normal_(self.gates_latent.weight, std=0.3)
+        nn.init.normal_(self.start_latent.weight, std=0.3)
+        # LSTM practice: remember at first (Jozefowicz et al. 2015).
+        with torch.no_grad():
+            self.gates_encoding.bias[self.size : 2 * self.size].fill_(1.0)
+
+    def start(self, encoding: Tensor, velocity: Tensor, agent: Tensor, latent: Tensor) -> Start:
+        """The beginning of rollouts.
+
+        Args:
+            encoding: h_enc [N, D].
+            velocity: [N, 2] last velocity.
+            agent: [R] row of ``encoding`` of each rollout.
+            latent: [R] latent value of each rollout.
+        """
+        gates = self.gates_encoding(encoding)[agent] + self.gates_latent(latent)
+        state = self.start_encoding(encoding)[agent] + self.start_latent(latent)
+        hidden, cell = state.split(self.size, dim=-1)
+        return Start(gates, torch.tanh(hidden), cell, velocity[agent])
+
+    def start_all(self, encoding: Tensor, velocity: Tensor) -> Start:
+        """Rollouts of every latent value for each agent: R = N Z rows, agent by agent."""
+        nodes, values = encoding.shape[0], self.gates_latent.num_embeddings
+        latent = torch.arange(values, device=encoding.device).repeat(nodes)  # [N Z]
+        agent = torch.arange(nodes, device=encoding.device).repeat_interleave(values)
+        return self.start(encoding, velocity, agent, latent)
+
+    def cell(self, start: Start, velocity: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """One LSTM step after velocity [R, 2]; gates in the order input, forget, output, new."""
+        gates = torch.addmm(start.gates, torch.cat([velocity, h], dim=-1), self.recurrent.weight.T)
+        open_, new = gates.split([3 * self.size, self.size], dim=-1)
+        i, f, o = torch.sigmoid(open_).chunk(3, dim=-1)
+        c = torch.addcmul(f * c, i, torch.tanh(new))
+        return o * torch.tanh(c), c
+
+    def mixture(self, h: Tensor, velocity: Tensor) -> BivariateMixture:
+        """The mixture over the next velocity from hidden states [..., size] and velocities [..., 2]."""
+        raw = self.head(h)
+        logits, raw = raw.split([self.components, 5 * self.components], dim=-1)
+        raw = raw.unflatten(-1, (self.components, 5))  # [..., M, 5]
+        mean, scale, rho = self.components_of(raw)
+        weights = torch.log_softmax(logits, dim=-1)
+        return BivariateMixture(weights, velocity.unsqueeze(-2) + mean, scale, rho)
+
+    def components_of(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean change, scale and correlation of components from raw outputs [..., 5]."""
+        span = self.log_sigma_max - self.log_sigma_min
+        scale = torch.exp(self.log_sigma_min + span * torch.sigmoid(raw[..., 2:4] - 1.0))
+        return raw[..., :2], scale, _CORRELATION_BOUND * torch.tanh(raw[..., 4])
+
+    def log_prob(self, start: Start, future: Tensor, given: Tensor | None = None) -> Tensor:
+        """Log density of each step of a future under teacher forcing: [R, H] nats.
+
+        Args:
+            start: R rollouts.
+            future: [R, H, 2] velocities, unclipped density.
+            given: [R, H, 2] the velocities fed back, when they differ from ``future``
+                (label noise); ``future`` when None.
+        """
+        given = future if given is None else given
+        h, c, velocity = start.hidden, start.cell, start.velocity
+        hidden, previous = [], []
+        for t in range(future.shape[1]):
+            h, c = self.cell(start, velocity, h, c)
+            hidden.append(h)
+            previous.append(velocity)
+            velocity = given[:, t]
+        mixture = self.mixture(torch.stack(hidden, dim=1), torch.stack(previous, dim=1))
+        return mixture.log_prob(future)
+
+    def sample(self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
+        """Sampled velocities [R, H, 2].
+
+        Args:
+            start: R rollouts.
+            uniform: [R, H] chooses components.
+            normal: [R, H, 2] standard normals.
+            limit: [R] speed limit, in units of the speed scale; what is fed back is limited too.
+        """
+        parts = [
+            self._sample_block(
+                Start(*(column[rows] for column in start)),
+                uniform[rows],
+                normal[rows],
+                limit[rows],
+            )
+            for first in range(0, uniform.shape[0], _BLOCK_ROWS)
+            for rows in (slice(first, first + _BLOCK_ROWS),)
+        ]
+        return torch.cat(parts) if parts else normal
+
+    def _sample_block(
+        self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor
+    ) -> Tensor:
+        h, c, velocity = start.hidden, start.cell, start.velocity
+        rows = torch.arange(uniform.shape[0], device=uniform.device)
+        steps = []
+        for t in range(uniform.shape[1]):
+            h, c = self.cell(start, velocity, h, c)
+            raw = self.head(h)
+            weights = torch.softmax(raw[:, : self.components], dim=-1)
+            index = choose(weights, uniform[:, t])
+            chosen = raw[:, self.components :].unflatten(-1, (self.components, 5))[rows, index]
+            change, scale, rho = self.components_of(chosen)
+            velocity = correlated(velocity + change, scale, rho, normal[:, t])
+            velocity = limit_speed(velocity, limit)
+            steps.append(velocity)
+        return torch.stack(steps, dim=1)
+
+    def moments(self, start: Start, horizon: int, limit: Tensor) -> tuple[Tensor, Tensor]:
+        """A rollout on the mixture's mean: velocity means and increments' covariances.
+
+        At each step the mixture is merged to one Gaussian and its mean, limited to ``limit``
+        [R], is fed back.
+
+        Returns:
+            mean [R, H, 2] and the covariance of the change of velocity [R, H, 3].
+        """
+        h, c, velocity = start.hidden, start.cell, start.velocity
+        means, covariances = [], []
+        for _ in range(horizon):
+            h, c = self.cell(start, velocity, h, c)
+            mean, covariance = self.mixture(h, velocity).moments()
+            velocity = limit_speed(mean, limit)
+            means.append(velocity)
+            covariances.append(covariance)
+        return torch.stack(means, dim=1), torch.stack(covariances, dim=1)

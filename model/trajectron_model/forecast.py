@@ -1,0 +1,366 @@
+"""Futures from states: requests and forecasts as values, batched over scenes.
+
+Three forms (paper, section 5, and its note on analytic mixtures):
+
+* ``full``: z ~ p(z|x), y ~ p(y|x,z); ``z_best``: z = argmax p(z|x), y ~ p(y|x,z).
+* ``gmm``: no sampling. Every latent value is one mode: its velocity mixture is merged to
+  one Gaussian at each step of a rollout on its mean, and carried to position space as a
+  random walk in velocity (``integration.RandomWalk``). Two approximations: the identity of
+  mixture components is not followed from step to step, and increments of velocity are
+  taken as independent of the velocity reached.
+
+An agent that has shown no direction gets an isotropic forecast: each of its samples is
+turned by a uniform angle of its own, and its modes are the moments of that.
+
+Samples of different agents are independent given the histories.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from trajectron_model.config import MAX_HORIZON, MAX_SAMPLES
+from trajectron_model.encoders import EncoderState
+from trajectron_model.features import Kinematics, from_frame, to_frame
+from trajectron_model.gmm import choose
+from trajectron_model.integration import RandomWalk, integrate
+from trajectron_model.noise import agent_noise
+from trajectron_model.state import SceneState, stack
+
+if TYPE_CHECKING:
+    from trajectron_model.trajectron import Trajectron
+
+Float32 = NDArray[np.float32]
+
+# A position is never known better than this: keeps covariances positive definite.
+_VARIANCE_FLOOR_M2 = 1e-6
+
+
+@dataclass(frozen=True)
+class ForecastRequest:
+    """What to forecast of one scene.
+
+    Attributes:
+        mode: see the module.
+        num_samples: S, 1 to 2000; ignored by ``gmm``.
+        horizon: H, 1 to 60 steps.
+        seed: 0 <= seed < 2**63.
+        step: of the session, its count of accepted frames: part of the key of the noise.
+        agents: ids wanted, in this order; None for all that can move.
+        include_modes: whether means and covariances are given; ``gmm`` always gives them.
+
+    Raises:
+        ValueError: a number out of its bounds.
+    """
+
+    mode: Literal["full", "z_best", "gmm"] = "full"
+    num_samples: int = 20
+    horizon: int = 12
+    seed: int = 0
+    step: int = 0
+    agents: tuple[str, ...] | None = None
+    include_modes: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("full", "z_best", "gmm"):
+            raise ValueError(f"mode {self.mode!r} is none of full, z_best, gmm")
+        if not 1 <= self.num_samples <= MAX_SAMPLES:
+            raise ValueError(f"num_samples must be 1 to {MAX_SAMPLES}")
+        if not 1 <= self.horizon <= MAX_HORIZON:
+            raise ValueError(f"horizon must be 1 to {MAX_HORIZON} steps")
+        if not (0 <= self.seed < 2**63 and 0 <= self.step < 2**63):
+            raise ValueError("seed and step must lie in 0 .. 2**63 - 1")
+
+    @property
+    def samples(self) -> int:
+        """How many samples are drawn: none for ``gmm``."""
+        return 0 if self.mode == "gmm" else self.num_samples
+
+    @property
+    def modes(self) -> bool:
+        """Whether means and covariances of modes are computed."""
+        return self.include_modes or self.mode == "gmm"
+
+
+@dataclass(frozen=True)
+class SceneForecast:
+    """The futures of one scene's agents; offsets are metres from ``position``, world axes."""
+
+    ids: tuple[str, ...]
+    types: tuple[str, ...]
+    position: NDArray[np.float64]  # [A, 2] last observed
+    last_seen_s: NDArray[np.float64]  # [A]
+    observations: NDArray[np.int64]  # [A]
+    heading_known: NDArray[np.bool_]  # [A]
+    mode_probabilities: Float32  # [A, Z]
+    mean: Float32 | None  # [A, Z, H, 2]
+    covariance: Float32 | None  # [A, Z, H, 3] xx, xy, yy
+    samples: Float32 | None  # [A, S, H, 2]
+    sample_modes: NDArray[np.int64] | None  # [A, S]
+
+
+class _Agents(NamedTuple):
+    """B agents of one type that are decoded together over one horizon."""
+
+    encoding: Tensor  # [B, D]
+    motion: Kinematics
+    log_prior: Tensor  # [B, Z]
+    keys: list[tuple[int, int]]  # (request, position in its forecast)
+    ids: list[str]
+
+
+def forecast_scenes(
+    model: Trajectron, states: Sequence[SceneState], requests: Sequence[ForecastRequest]
+) -> list[SceneForecast]:
+    """The futures that each request asks of its state; see ``Trajectron.forecast``."""
+    if not states:
+        return []
+    picked = [_rows(model, s, r) for s, r in zip(states, requests, strict=True)]
+    results = [
+        _blank(model, s, r, rows) for s, r, rows in zip(states, requests, picked, strict=True)
+    ]
+    for (kind, horizon), agents in _groups(model, states, requests, picked).items():
+        for (request, at), row in zip(
+            agents.keys, agents.log_prior.exp().cpu().numpy(), strict=True
+        ):
+            results[request].mode_probabilities[at] = row
+        _fill_modes(model, kind, horizon, agents, requests, results)
+        _fill_samples(model, kind, horizon, agents, requests, results)
+    return results
+
+
+def _rows(model: Trajectron, state: SceneState, request: ForecastRequest) -> list[int]:
+    if request.agents is None:
+        stationary = [t.stationary for t in model.config.types]
+        return [row for row, kind in enumerate(state.node_type.tolist()) if not stationary[kind]]
+    row_of = {agent: row for row, agent in enumerate(state.ids)}
+    return [row_of[agent] for agent in request.agents]
+
+
+def _blank(
+    model: Trajectron, state: SceneState, request: ForecastRequest, rows: list[int]
+) -> SceneForecast:
+    """A forecast whose arrays are still to be filled."""
+    agents, values, horizon = len(rows), model.config.latent_values, request.horizon
+    names = model.config.node_types
+    index = torch.tensor(rows, dtype=torch.int64, device=state.node_type.device)
+    shape = (agents, values, horizon)
+    return SceneForecast(
+        ids=tuple(state.ids[row] for row in rows),
+        types=tuple(names[kind] for kind in state.node_type[index].tolist()),
+        position=state.motion.position[index].cpu().numpy(),
+        last_seen_s=state.motion.last_seen_s[index].cpu().numpy(),
+        observations=state.motion.observations[index].cpu().numpy(),
+        heading_known=state.motion.heading_known[index].cpu().numpy(),
+        mode_probabilities=np.zeros((agents, values), dtype=np.float32),
+        mean=np.zeros((*shape, 2), dtype=np.float32) if request.modes else None,
+        covariance=np.zeros((*shape, 3), dtype=np.float32) if request.modes else None,
+        samples=(
+            np.zeros((agents, request.samples, horizon, 2), dtype=np.float32)
+            if request.samples
+            else None
+        ),
+        sample_modes=(
+            np.zeros((agents, request.samples), dtype=np.int64) if request.samples else None
+        ),
+    )
+
+
+def _groups(
+    model: Trajectron,
+    states: Sequence[SceneState],
+    requests: Sequence[ForecastRequest],
+    picked: list[list[int]],
+) -> dict[tuple[int, int], _Agents]:
+    """Agents of all requests by (type, horizon), encoded."""
+    stacked = stack(states)
+    kinds = stacked.node_type.tolist()
+    members: dict[tuple[int, int], list[tuple[int, int, int]]] = defaultdict(list)
+    first = 0
+    for number, (state, request, rows) in enumerate(zip(states, requests, picked, strict=True)):
+        for at, row in enumerate(rows):
+            members[kinds[first + row], request.horizon].append((number, at, first + row))
+        first += len(state.ids)
+    groups = {}
+    for (kind, horizon), found in members.items():
+        index = torch.tensor([row for _, _, row in found], device=stacked.node_type.device)
+        networks = model.node_model(kind)
+        encoding = networks.encoding(
+            EncoderState(*(column[index] for column in stacked.encoder)), stacked.influence[index]
+        )
+        groups[kind, horizon] = _Agents(
+            encoding=encoding,
+            motion=Kinematics(*(column[index] for column in stacked.motion)),
+            log_prior=networks.latent.prior(encoding),
+            keys=[(number, at) for number, at, _ in found],
+            ids=[stacked.ids[row] for _, _, row in found],
+        )
+    return groups
+
+
+def start_velocity(model: Trajectron, motion: Kinematics, kind: int) -> Tensor:
+    """y_0 [N, 2]: the last causal velocity in the node's frame, over the type's speed scale."""
+    frame = model.features.frame(motion)
+    velocity = to_frame(motion.velocity, frame) / model.config.types[kind].speed_scale_mps
+    if not model.features.isotropic_without_heading:
+        return velocity
+    return torch.where(motion.heading_known.unsqueeze(-1), velocity, 0.0)
+
+
+def _turned(model: Trajectron, motion: Kinematics) -> Tensor:
+    """[N] whether the agent's forecast has no direction of its own."""
+    if model.features.isotropic_without_heading:
+        return ~motion.heading_known
+    return torch.zeros_like(motion.heading_known)
+
+
+def _fill_modes(
+    model: Trajectron,
+    kind: int,
+    horizon: int,
+    agents: _Agents,
+    requests: Sequence[ForecastRequest],
+    results: list[SceneForecast],
+) -> None:
+    wanted = [i for i, (number, _) in enumerate(agents.keys) if requests[number].modes]
+    if not wanted:
+        return
+    index = torch.tensor(wanted, device=agents.encoding.device)
+    motion = Kinematics(*(column[index] for column in agents.motion))
+    mean, covariance = mode_moments(model, kind, agents.encoding[index], motion, horizon)
+    means, covariances = mean.cpu().numpy(), covariance.cpu().numpy()
+    for row, i in enumerate(wanted):
+        number, at = agents.keys[i]
+        result = results[number]
+        assert result.mean is not None and result.covariance is not None
+        result.mean[at], result.covariance[at] = means[row], covariances[row]
+
+
+def mode_moments(
+    model: Trajectron, kind: int, encoding: Tensor, motion: Kinematics, horizon: int
+) -> tuple[Tensor, Tensor]:
+    """Position-space Gaussian of every latent value at every step.
+
+    Args:
+        kind: type index of the N nodes.
+        encoding: [N, D] h_enc.
+        motion: of the N nodes.
+        horizon: H.
+
+    Returns:
+        mean [N, Z, H, 2] as offsets in metres and covariance [N, Z, H, 3], world axes.
+    """
+    agent_type, dt_s = model.config.types[kind], model.config.dt_s
+    nodes, values = encoding.shape[0], model.config.latent_values
+    decoder, scale = model.node_model(kind).decoder, agent_type.speed_scale_mps
+    start = decoder.start_all(encoding, start_velocity(model, motion, kind))
+    limit = start.velocity.new_full((nodes * values,), agent_type.speed_limit_mps / scale)
+    velocity, increment = decoder.moments(start, horizon, limit)
+    if agent_type.stationary:
+        increment = torch.zeros_like(increment)
+    mean = integrate(velocity, dt_s) * scale  # [N Z, H, 2]
+    walk = RandomWalk(dt_s, increment[:, 0])
+    spread = [walk.step(increment[:, t]) * scale**2 for t in range(horizon)]
+    covariance = torch.stack(spread, dim=1)  # [N Z, H, 3]
+    mean = mean.reshape(nodes, values, horizon, 2)
+    covariance = covariance.reshape(nodes, values, horizon, 3)
+    axis = model.features.frame(motion)[:, None, None, :]
+    turned = _turned(model, motion)[:, None, None, None]
+    square = mean.square().sum(-1) + covariance[..., 0] + covariance[..., 2]
+    round_ = torch.stack([0.5 * square, torch.zeros_like(square), 0.5 * square], dim=-1)
+    covariance = torch.where(turned, round_, _rotate(covariance, axis))
+    mean = torch.where(turned, 0.0, from_frame(mean, axis))
+    floor = covariance.new_tensor([_VARIANCE_FLOOR_M2, 0.0, _VARIANCE_FLOOR_M2])
+    return mean, covariance + floor
+
+
+def _rotate(covariance: Tensor, axis: Tensor) -> Tensor:
+    """Covariances [..., 3] from the frame with first axis ``axis`` [..., 2] to the world's."""
+    c, s = axis[..., 0], axis[..., 1]
+    xx, xy, yy = covariance.unbind(dim=-1)
+    return torch.stack(
+        [
+            c * c * xx - 2.0 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2.0 * c * s * xy + c * c * yy,
+        ],
+        dim=-1,
+    )
+
+
+def _fill_samples(
+    model: Trajectron,
+    kind: int,
+    horizon: int,
+    agents: _Agents,
+    requests: Sequence[ForecastRequest],
+    results: list[SceneForecast],
+) -> None:
+    wanted = [i for i, (number, _) in enumerate(agents.keys) if requests[number].samples]
+    if not wanted:
+        return
+    device = agents.encoding.device
+    noise = []
+    for i in wanted:
+        request = requests[agents.keys[i][0]]
+        noise.append(
+            agent_noise(request.seed, agents.ids[i], request.step, request.samples, horizon)
+        )
+    counts = [n.latent.size for n in noise]
+    latent, turn, component, normal = (
+        torch.from_numpy(np.concatenate(column)).to(device) for column in zip(*noise, strict=True)
+    )
+    best = [requests[agents.keys[i][0]].mode == "z_best" for i in wanted]
+    repeats = torch.tensor(counts, device=device)
+    agent = torch.tensor(wanted, device=device).repeat_interleave(repeats)  # [R]
+    prior = agents.log_prior.exp()
+    modes = choose(prior[agent], latent)
+    modes = torch.where(
+        torch.tensor(best, device=device).repeat_interleave(repeats),
+        agents.log_prior.argmax(dim=-1)[agent],
+        modes,
+    )
+    offsets = _sample_offsets(model, kind, agents, agent, modes, turn, component, normal)
+    values, latents = offsets.cpu().numpy(), modes.cpu().numpy()
+    ends = np.cumsum(counts)
+    for i, last, count in zip(wanted, ends, counts, strict=True):
+        number, at = agents.keys[i]
+        result = results[number]
+        assert result.samples is not None and result.sample_modes is not None
+        result.samples[at] = values[last - count : last]
+        result.sample_modes[at] = latents[last - count : last]
+
+
+def _sample_offsets(
+    model: Trajectron,
+    kind: int,
+    agents: _Agents,
+    agent: Tensor,
+    modes: Tensor,
+    turn: Tensor,
+    component: Tensor,
+    normal: Tensor,
+) -> Tensor:
+    """Sampled offsets [R, H, 2] in metres, world axes, of rows (agent [R], latent value [R])."""
+    agent_type, networks = model.config.types[kind], model.node_model(kind)
+    velocity = start_velocity(model, agents.motion, kind)
+    start = networks.decoder.start(agents.encoding, velocity, agent, modes)
+    limit = agent_type.speed_limit_mps / agent_type.speed_scale_mps
+    sampled = networks.decoder.sample(
+        start, component, normal, start.velocity.new_full((agent.shape[0],), limit)
+    )
+    angle = turn * (2.0 * math.pi)
+    any_axis = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    axis = model.features.frame(agents.motion)[agent]
+    axis = torch.where(_turned(model, agents.motion)[agent].unsqueeze(-1), any_axis, axis)
+    offsets = integrate(sampled, model.config.dt_s) * agent_type.speed_scale_mps
+    return from_frame(offsets, axis.unsqueeze(1))
