@@ -27,7 +27,8 @@ def displacement(forecast: NDArray[np.floating], truth: Float) -> Float:
 
 def average_displacement(distance: Float) -> Float:
     """ADE: the mean over the horizon. [..., A, H] metres to [..., A] metres."""
-    return distance.mean(axis=-1)
+    ade: Float = distance.mean(axis=-1)
+    return ade
 
 
 def final_displacement(distance: Float) -> Float:
@@ -51,7 +52,8 @@ def best_of(errors: Float, n: int) -> Float:
     Raises:
         ValueError: fewer than ``n`` samples.
     """
-    return _groups(errors, n).min(axis=1).mean(axis=0)
+    best: Float = _groups(errors, n).min(axis=1).mean(axis=0)
+    return best
 
 
 def joint_best_of(errors: Float, n: int) -> Float:
@@ -72,7 +74,8 @@ def joint_best_of(errors: Float, n: int) -> Float:
     """
     groups = _groups(errors, n)
     chosen = groups.sum(axis=-1).argmin(axis=1)  # [G]
-    return groups[np.arange(len(groups)), chosen].mean(axis=0)
+    best: Float = groups[np.arange(len(groups)), chosen].mean(axis=0)
+    return best
 
 
 def _groups(errors: Float, n: int) -> Float:

@@ -7,21 +7,22 @@ header, an empty file. Rows may stand in any order.
 
 from __future__ import annotations
 
-import csv
-import hashlib
-import io
-import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trajectron_model.data.errors import DataError
+from trajectron_model.data.parsing import (
+    CSV_COLUMNS,
+    Rows,
+    agents_of,
+    csv_rows,
+    load,
+    whitespace_rows,
+)
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.resampling import MAX_GAP_S, MAX_STEPS, GridRows, resample
 
-CSV_COLUMNS = ("time", "id", "type", "x", "y")
 PEDESTRIAN = "pedestrian"
 APOLLOSCAPE_DT_S = 0.5
 APOLLOSCAPE_TYPES = {1: "vehicle", 2: "vehicle", 3: "pedestrian", 4: "cyclist"}
@@ -30,24 +31,6 @@ APOLLOSCAPE_TYPES = {1: "vehicle", 2: "vehicle", 3: "pedestrian", 4: "cyclist"}
 _APOLLOSCAPE_OTHER = 5
 _ETH_UCY_COLUMNS = 4
 _APOLLOSCAPE_COLUMNS = 10
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """A file's rows; R of them.
-
-    Attributes:
-        line: [R] line in the file, from 1.
-        time: [R] seconds, or frame numbers.
-        id, type: [R].
-        position: [R, 2] metres.
-    """
-
-    line: NDArray[np.int64]
-    time: NDArray[np.float64]
-    id: list[str]
-    type: list[str]
-    position: NDArray[np.float64]
 
 
 def read_eth_ucy(
@@ -67,8 +50,8 @@ def read_eth_ucy(
         DataError: as the module says, or a frame that is not on the grid.
     """
     path = Path(path)
-    text, sha256 = _load(path)
-    rows = _whitespace_rows(path, text, _ETH_UCY_COLUMNS, type_column=None, only_type=agent_type)
+    text, sha256 = load(path)
+    rows = whitespace_rows(path, text, _ETH_UCY_COLUMNS, type_column=None, only_type=agent_type)
     first_frame = rows.time.min()
     steps = (rows.time - first_frame) / frames_per_step
     off_grid = np.flatnonzero(steps != np.rint(steps))
@@ -82,7 +65,7 @@ def read_eth_ucy(
         )
     _check_length(path, rows, float(steps.max()))
     start_time_s = float(first_frame) * dt_s / frames_per_step
-    ids, types, agent = _agents(path, rows)
+    ids, types, agent = agents_of(path, rows)
     grid = GridRows(steps.astype(np.int64), agent, rows.position)
     return _recording(path, sha256, dt_s, start_time_s, ids, types, grid)
 
@@ -99,8 +82,8 @@ def read_csv(path: str | Path, dt_s: float = 0.4, *, max_gap_s: float = MAX_GAP_
             that none can be put on the grid.
     """
     path = Path(path)
-    text, sha256 = _load(path)
-    return _resampled(path, sha256, _csv_rows(path, text), dt_s, max_gap_s)
+    text, sha256 = load(path)
+    return _resampled(path, sha256, csv_rows(path, text), dt_s, max_gap_s)
 
 
 def read_apolloscape(
@@ -121,13 +104,13 @@ def read_apolloscape(
         DataError: as the module says, an unknown type or an agent that changes type.
     """
     path = Path(path)
-    text, sha256 = _load(path)
-    rows = _whitespace_rows(path, text, _APOLLOSCAPE_COLUMNS, type_column=2, only_type="")
+    text, sha256 = load(path)
+    rows = whitespace_rows(path, text, _APOLLOSCAPE_COLUMNS, type_column=2, only_type="")
     fractional = np.flatnonzero(rows.time != np.rint(rows.time))
     if len(fractional):
         raise DataError(path, int(rows.line[fractional[0]]), "the frame must be a whole number")
     rows = _named_types(path, rows, include_other)
-    rows = _Rows(rows.line, rows.time * APOLLOSCAPE_DT_S, rows.id, rows.type, rows.position)
+    rows = Rows(rows.line, rows.time * APOLLOSCAPE_DT_S, rows.id, rows.type, rows.position)
     max_gap_s = 0.0 if dt_s == APOLLOSCAPE_DT_S else max_gap_s
     return _resampled(path, sha256, rows, dt_s, max_gap_s)
 
@@ -145,7 +128,7 @@ def read(path: str | Path, *, dt_s: float = 0.4, frames_per_step: int = 10) -> R
         DataError: none of them, or as the reader of that format says.
     """
     path = Path(path)
-    text, _ = _load(path)
+    text, _ = load(path)
     line, first = next((n, t) for n, t in enumerate(text.splitlines(), start=1) if t.strip())
     if "," in first:
         return read_csv(path, dt_s)
@@ -162,105 +145,7 @@ def read(path: str | Path, *, dt_s: float = 0.4, frames_per_step: int = 10) -> R
     )
 
 
-def _load(path: Path) -> tuple[str, str]:
-    """The file's text and the SHA-256 of its bytes."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, None, error.strerror or str(error)) from error
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise DataError(path, line, "not UTF-8 text") from error
-    if not text.strip():
-        raise DataError(path, 1, "the file is empty")
-    return text, hashlib.sha256(data).hexdigest()
-
-
-def _number(path: Path, line: int, column: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise DataError(path, line, f"{column} is {text!r}, not a number") from None
-    if not math.isfinite(value):
-        raise DataError(path, line, f"{column} is {text}; it must be finite")
-    return value
-
-
-def _whitespace_rows(
-    path: Path, text: str, columns: int, *, type_column: int | None, only_type: str
-) -> _Rows:
-    """Rows of frame, id, [type,] x, y, ... split by whitespace; all columns must be numbers."""
-    names = ["frame", "id", "x", "y"] if type_column is None else ["frame", "id", "type", "x", "y"]
-    names += [f"column {n}" for n in range(len(names) + 1, columns + 1)]
-    x = names.index("x")
-    lines: list[int] = []
-    values: list[list[float]] = []
-    for line, row in enumerate(text.splitlines(), start=1):
-        cells = row.split()
-        if not cells:
-            continue
-        if len(cells) != columns:
-            raise DataError(path, line, f"{len(cells)} columns; expected {columns}")
-        values.append([_number(path, line, *cell) for cell in zip(names, cells, strict=True)])
-        lines.append(line)
-    table = np.array(values)  # [R, columns]
-    ids = [str(int(v)) if v.is_integer() else str(v) for v in table[:, 1].tolist()]
-    types = (
-        [only_type] * len(ids)
-        if type_column is None
-        else [f"{v:g}" for v in table[:, type_column].tolist()]
-    )
-    return _Rows(np.array(lines), table[:, 0], ids, types, table[:, x : x + 2])
-
-
-def _csv_rows(path: Path, text: str) -> _Rows:
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    lines: list[int] = []
-    ids: list[str] = []
-    types: list[str] = []
-    values: list[tuple[float, float, float]] = []
-    order: list[int] | None = None
-    try:
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            if not any(cells):
-                continue
-            line = reader.line_num
-            if order is None:
-                order = _csv_order(path, line, cells)
-                continue
-            if len(cells) != len(CSV_COLUMNS):
-                reason = f"{len(cells)} columns; expected {len(CSV_COLUMNS)}"
-                raise DataError(path, line, reason)
-            time, id_, type_, x, y = (cells[index] for index in order)
-            if not id_ or not type_:
-                raise DataError(path, line, f"{'type' if id_ else 'id'} is empty")
-            numbers = zip(("time", "x", "y"), (time, x, y), strict=True)
-            t_s, x_m, y_m = (_number(path, line, name, cell) for name, cell in numbers)
-            lines.append(line)
-            ids.append(id_)
-            types.append(type_)
-            values.append((t_s, x_m, y_m))
-    except csv.Error as error:
-        raise DataError(path, reader.line_num, f"not CSV: {error}") from error
-    if not values:
-        raise DataError(path, reader.line_num, "there are no rows after the header")
-    table = np.array(values)  # [R, 3]
-    return _Rows(np.array(lines), table[:, 0], ids, types, table[:, 1:])
-
-
-def _csv_order(path: Path, line: int, header: list[str]) -> list[int]:
-    """Where each of `CSV_COLUMNS` stands in the header."""
-    names = [name.lower() for name in header]
-    if sorted(names) != sorted(CSV_COLUMNS):
-        reason = f"the header is {','.join(header)}; expected {','.join(CSV_COLUMNS)}"
-        raise DataError(path, line, reason)
-    return [names.index(column) for column in CSV_COLUMNS]
-
-
-def _named_types(path: Path, rows: _Rows, include_other: bool) -> _Rows:
+def _named_types(path: Path, rows: Rows, include_other: bool) -> Rows:
     """ApolloScape's type numbers as names; rows of type 5 dropped unless asked for."""
     names = {f"{number}": name for number, name in APOLLOSCAPE_TYPES.items()}
     names[f"{_APOLLOSCAPE_OTHER}"] = "other"
@@ -271,7 +156,7 @@ def _named_types(path: Path, rows: _Rows, include_other: bool) -> _Rows:
     kept = [n for n, name in enumerate(types) if include_other or name != "other"]
     if not kept:
         raise DataError(path, None, "there are only agents of type 5 (other)")
-    return _Rows(
+    return Rows(
         rows.line[kept],
         rows.time[kept],
         [rows.id[n] for n in kept],
@@ -280,46 +165,17 @@ def _named_types(path: Path, rows: _Rows, include_other: bool) -> _Rows:
     )
 
 
-def _agents(path: Path, rows: _Rows) -> tuple[tuple[str, ...], tuple[str, ...], NDArray[np.int64]]:
-    """The file's agents, in the order in which they appear (by time, then by line).
-
-    Returns:
-        ids, types: [A].
-        agent: [R] index into them.
-
-    Raises:
-        DataError: an agent twice at one time, or of two types.
-    """
-    index: dict[str, int] = {}
-    types: list[str] = []
-    seen: dict[tuple[float, int], int] = {}
-    agent = np.empty(len(rows.id), dtype=np.int64)
-    for row in np.argsort(rows.time, kind="stable").tolist():
-        line, id_, time = int(rows.line[row]), rows.id[row], float(rows.time[row])
-        number = index.setdefault(id_, len(index))
-        agent[row] = number
-        if number == len(types):
-            types.append(rows.type[row])
-        elif types[number] != rows.type[row]:
-            reason = f"agent {id_} is a {rows.type[row]} here and a {types[number]} before"
-            raise DataError(path, line, reason)
-        other = seen.setdefault((time, number), line)
-        if other != line:
-            raise DataError(path, line, f"agent {id_} is at time {time:g} on line {other} already")
-    return tuple(index), tuple(types), agent
-
-
-def _resampled(path: Path, sha256: str, rows: _Rows, dt_s: float, max_gap_s: float) -> Recording:
+def _resampled(path: Path, sha256: str, rows: Rows, dt_s: float, max_gap_s: float) -> Recording:
     origin_s = float(rows.time.min())
     _check_length(path, rows, (float(rows.time.max()) - origin_s) / dt_s)
-    ids, types, agent = _agents(path, rows)
+    ids, types, agent = agents_of(path, rows)
     grid = resample(
         rows.time, agent, rows.position, origin_s=origin_s, dt_s=dt_s, max_gap_s=max_gap_s
     )
     return _recording(path, sha256, dt_s, origin_s, ids, types, grid)
 
 
-def _check_length(path: Path, rows: _Rows, steps: float) -> None:
+def _check_length(path: Path, rows: Rows, steps: float) -> None:
     if steps >= MAX_STEPS:
         reason = f"{steps:.3g} steps after the first row; at most {MAX_STEPS} fit a recording"
         raise DataError(path, int(rows.line[rows.time.argmax()]), reason)

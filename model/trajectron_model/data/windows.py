@@ -5,7 +5,7 @@ Shape letters: T observed steps, H horizon steps, A judged agents.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -104,9 +104,37 @@ def sgan_windows(
     ]
 
 
-def _stretches(
-    recording: Recording, length: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+@dataclass(frozen=True)
+class Protocol:
+    """Which windows are cut from recordings; see `sgan_windows`."""
+
+    name: str
+    observed: int = 8
+    horizon: int = 12
+    min_agents: int = 2
+
+    def windows(self, recordings: Iterable[Recording]) -> list[Window]:
+        """The windows of these recordings, in their order."""
+        return [
+            window
+            for recording in recordings
+            for window in sgan_windows(
+                recording,
+                observed=self.observed,
+                horizon=self.horizon,
+                min_agents=self.min_agents,
+            )
+        ]
+
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (Protocol("sgan", min_agents=2), Protocol("all", min_agents=1))
+}
+"""The leave-one-out protocols of Social GAN, and the same with single agents judged too."""
+
+
+def _stretches(recording: Recording, length: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Every (first step, agent) from which the agent is present in ``length`` steps on end."""
     order = np.lexsort((recording.step, recording.agent))
     step, agent = recording.step[order], recording.agent[order]

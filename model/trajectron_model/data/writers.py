@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from typing import TextIO
 
-from trajectron_model.data.readers import CSV_COLUMNS
+from trajectron_model.data.parsing import CSV_COLUMNS
 from trajectron_model.data.recording import Recording
 
 
