@@ -16,6 +16,10 @@ Answer = TypeVar("Answer")
 
 # Where every gRPC library looks for the details of a status.
 _DETAILS_KEY = "grpc-status-details-bin"
+# Trailing metadata has room for 8 KiB: a message may quote an id as long as a book.
+_LONGEST_TEXT = 1000
+_MOST_VIOLATIONS = 10
+_LONGEST_VIOLATION = 200
 
 
 def status_message(error: ServiceError) -> status_pb2.Status:
@@ -26,9 +30,10 @@ def status_message(error: ServiceError) -> status_pb2.Status:
             error_details_pb2.BadRequest(
                 field_violations=[
                     error_details_pb2.BadRequest.FieldViolation(
-                        field=violation.field, description=violation.description
+                        field=violation.field[:_LONGEST_VIOLATION],
+                        description=violation.description[:_LONGEST_VIOLATION],
                     )
-                    for violation in error.violations
+                    for violation in error.violations[:_MOST_VIOLATIONS]
                 ]
             )
         )
@@ -38,7 +43,7 @@ def status_message(error: ServiceError) -> status_pb2.Status:
         details.append(error_details_pb2.RetryInfo(retry_delay=delay))
     return status_pb2.Status(
         code=status_code(error).value[0],
-        message=error.message,
+        message=error.message[:_LONGEST_TEXT],
         details=[_packed(detail) for detail in details],
     )
 
@@ -52,8 +57,9 @@ async def abort(
     context: grpc.aio.ServicerContext[Request, Answer], error: ServiceError
 ) -> NoReturn:
     """Ends a call with an error's status and its details."""
-    details = status_message(error).SerializeToString()
-    await context.abort(status_code(error), error.message, ((_DETAILS_KEY, details),))
+    status = status_message(error)
+    metadata = ((_DETAILS_KEY, status.SerializeToString()),)
+    await context.abort(status_code(error), status.message, metadata)
 
 
 def _packed(detail: Message) -> any_pb2.Any:

@@ -12,14 +12,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
-from trajectron_service.messages import (
-    Agent,
-    ForecastMode,
-    ForecastOptions,
-    Frame,
-    SessionConfig,
-    UnknownTypes,
-)
+from trajectron_service import messages as core
+from trajectron_service.messages import ForecastMode, UnknownTypes
 
 _EXAMPLE_FRAMES: list[dict[str, Any]] = [
     {"time": 0.0, "agents": [{"id": "7", "type": "pedestrian", "x": 8.46, "y": 3.59}]},
@@ -48,39 +42,38 @@ class Body(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class AgentBody(Body):
+class Agent(Body):
     """One observed agent of a frame."""
 
-    model_config = ConfigDict(title="Agent", json_schema_extra=_required("id", "type", "x", "y"))
+    model_config = ConfigDict(json_schema_extra=_required("id", "type", "x", "y"))
 
     id: str = Field("", description="Stable over frames, unique within a frame; 1 to 128 letters.")
     type: str = Field("", description="An agent type of the model, such as `pedestrian`.")
     x: _Number = Field(None, description="Metres, in your own world-fixed frame; finite.")
     y: _Number = Field(None, description="Metres, in your own world-fixed frame; finite.")
 
-    def to_core(self) -> Agent:
+    def to_core(self) -> core.Agent:
         """The agent as the core takes it."""
-        return Agent(self.id, self.type, self.x, self.y)
+        return core.Agent(self.id, self.type, self.x, self.y)
 
 
-class FrameBody(Body):
+class Frame(Body):
     """Everything seen in a scene at one instant; no agents is a valid observation."""
 
-    model_config = ConfigDict(title="Frame", json_schema_extra=_required("time", "agents"))
+    model_config = ConfigDict(json_schema_extra=_required("time", "agents"))
 
     time: _Number = Field(None, description="Seconds on your own clock.")
-    agents: tuple[AgentBody, ...] = Field((), description="The agents seen; may be empty.")
+    agents: tuple[Agent, ...] = Field((), description="The agents seen; may be empty.")
 
-    def to_core(self) -> Frame:
+    def to_core(self) -> core.Frame:
         """The frame as the core takes it."""
-        return Frame(self.time, tuple(agent.to_core() for agent in self.agents))
+        return core.Frame(self.time, tuple(agent.to_core() for agent in self.agents))
 
 
-class ForecastBody(Body):
+class ForecastOptions(Body):
     """What to forecast."""
 
     model_config = ConfigDict(
-        title="ForecastOptions",
         json_schema_extra={"examples": [{"mode": "full", "num_samples": 20, "horizon": 12}]},
     )
 
@@ -110,9 +103,9 @@ class ForecastBody(Body):
         "`gmm`. Mode probabilities are always returned.",
     )
 
-    def to_options(self) -> ForecastOptions:
+    def to_options(self) -> core.ForecastOptions:
         """The options as the core takes them."""
-        return ForecastOptions(
+        return core.ForecastOptions(
             mode=self.mode,
             num_samples=self.num_samples,
             horizon=self.horizon,
@@ -146,11 +139,10 @@ _TypeMap = Annotated[
 ]
 
 
-class PredictBody(ForecastBody):
+class PredictRequest(ForecastOptions):
     """A scene's history, and what to forecast from it."""
 
     model_config = ConfigDict(
-        title="PredictRequest",
         json_schema_extra=_required(
             "frames",
             examples=[
@@ -165,22 +157,21 @@ class PredictBody(ForecastBody):
         ),
     )
 
-    frames: tuple[FrameBody, ...] = Field((), description="At least one, in order of time.")
+    frames: tuple[Frame, ...] = Field((), description="At least one, in order of time.")
     model: _Model = None
     unknown_types: _UnknownTypes = UnknownTypes.REJECT
     type_map: _TypeMap = {}
     frame_interval_s: _FrameInterval = None
 
-    def to_frames(self) -> tuple[Frame, ...]:
+    def to_frames(self) -> tuple[core.Frame, ...]:
         """The history as the core takes it."""
         return tuple(frame.to_core() for frame in self.frames)
 
 
-class CreateSessionBody(Body):
+class CreateSessionRequest(Body):
     """A new session, and how it reads its frames."""
 
     model_config = ConfigDict(
-        title="CreateSessionRequest",
         json_schema_extra={"examples": [{"id": "crossing-4", "agent_timeout_s": 4.0}]},
     )
 
@@ -202,9 +193,9 @@ class CreateSessionBody(Body):
     unknown_types: _UnknownTypes = UnknownTypes.REJECT
     type_map: _TypeMap = {}
 
-    def to_config(self) -> SessionConfig:
+    def to_config(self) -> core.SessionConfig:
         """The configuration as the core takes it."""
-        return SessionConfig(
+        return core.SessionConfig(
             model=self.model or None,
             frame_interval_s=self.frame_interval_s,
             agent_timeout_s=self.agent_timeout_s,
@@ -214,22 +205,19 @@ class CreateSessionBody(Body):
         )
 
 
-class ObserveBody(Body):
+class ObserveRequest(Body):
     """Frames for a session, in order of time."""
 
     model_config = ConfigDict(
-        title="ObserveRequest",
         json_schema_extra=_required("frames", examples=[{"frames": _EXAMPLE_FRAMES}]),
     )
 
-    frames: tuple[FrameBody, ...] = Field((), description="At least one, in order of time.")
+    frames: tuple[Frame, ...] = Field((), description="At least one, in order of time.")
 
-    def to_frames(self) -> tuple[Frame, ...]:
+    def to_frames(self) -> tuple[core.Frame, ...]:
         """The frames as the core takes them."""
         return tuple(frame.to_core() for frame in self.frames)
 
 
-class PredictSessionBody(ForecastBody):
+class PredictSessionRequest(ForecastOptions):
     """What to forecast from the session's newest frame; an empty body asks for the defaults."""
-
-    model_config = ConfigDict(title="PredictSessionRequest")

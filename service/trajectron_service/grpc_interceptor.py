@@ -1,0 +1,153 @@
+"""What every RPC of ours goes through: decoding, errors into statuses, measuring, logging."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import aclosing, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+from google.protobuf.message import DecodeError
+
+from trajectron_service import logs
+from trajectron_service.errors import ErrorKind, ServiceError
+from trajectron_service.grpc_errors import abort
+from trajectron_service.metrics import Metrics
+
+# Requests, answers and handlers of all methods: gRPC gives them no common type.
+Handler = grpc.RpcMethodHandler[Any, Any]
+Context = grpc.aio.ServicerContext[Any, Any]
+
+log = logs.get(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Malformed:
+    """Stands for a request whose bytes are no message, until the handler can refuse it."""
+
+    reason: str
+
+
+class GrpcInterceptor(grpc.aio.ServerInterceptor):
+    """Wraps the handlers of one service; those of others (health, reflection) pass as they are.
+
+    Args:
+        service: the full name of the service, such as ``trajectron.v1.TrajectronService``.
+        metrics: where durations and stages go.
+    """
+
+    def __init__(self, service: str, metrics: Metrics) -> None:
+        self._prefix = f"/{service}/"
+        self._metrics = metrics
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler | None]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Handler | None:
+        """The handler of a call, wrapped (the hook that gRPC calls)."""
+        handler = await continuation(handler_call_details)
+        path = handler_call_details.method
+        if handler is None or not path.startswith(self._prefix):
+            return handler
+        method = path.removeprefix(self._prefix)
+        wrap = grpc.unary_unary_rpc_method_handler
+        call: Any = self._unary(method, handler.unary_unary)
+        if handler.request_streaming:
+            wrap = grpc.stream_stream_rpc_method_handler
+            call = self._stream(method, handler.stream_stream)
+        return wrap(
+            call,
+            request_deserializer=self._decoder(handler.request_deserializer),
+            response_serializer=self._encoder(handler.response_serializer),
+        )
+
+    def _unary(self, method: str, behaviour: Any) -> Any:
+        async def call(request: Any, context: Context) -> Any:
+            with self._measured(method) as record:
+                try:
+                    return await behaviour(_checked(request), context)
+                except Exception as error:  # noqa: BLE001  every fault becomes a status
+                    await abort(context, record.failed(error))
+
+        return call
+
+    def _stream(self, method: str, behaviour: Any) -> Any:
+        async def call(requests: AsyncIterator[Any], context: Context) -> AsyncIterator[Any]:
+            with self._measured(method) as record:
+                try:
+                    # Closed here, not by the garbage collector: a cancelled stream frees its
+                    # session at once.
+                    async with aclosing(behaviour(_all_checked(requests), context)) as answers:
+                        async for answer in answers:
+                            yield answer
+                except Exception as error:  # noqa: BLE001  every fault becomes a status
+                    await abort(context, record.failed(error))
+
+        return call
+
+    @contextmanager
+    def _measured(self, method: str) -> Iterator[_Record]:
+        record = _Record(method)
+        start = time.perf_counter()
+        try:
+            yield record
+        except (asyncio.CancelledError, GeneratorExit):
+            record.code = grpc.StatusCode.CANCELLED.name
+            raise
+        finally:
+            duration_s = time.perf_counter() - start
+            self._metrics.request("grpc", method, record.code, duration_s)
+            log.info(
+                "call", protocol="grpc", method=method, code=record.code, duration_s=duration_s
+            )
+
+    def _decoder(self, parse: Any) -> Callable[[bytes], Any]:
+        def decode(data: bytes) -> Any:
+            with self._metrics.stage("decode"):
+                try:
+                    return parse(data)
+                except DecodeError as error:
+                    return _Malformed(str(error))
+
+        return decode
+
+    def _encoder(self, serialise: Any) -> Callable[[Any], bytes]:
+        def encode(message: Any) -> bytes:
+            with self._metrics.stage("serialise"):
+                data: bytes = serialise(message)
+                return data
+
+        return encode
+
+
+class _Record:
+    """How a call ended."""
+
+    def __init__(self, method: str) -> None:
+        self.code = grpc.StatusCode.OK.name
+        self._method = method
+
+    def failed(self, error: Exception) -> ServiceError:
+        """The error to tell the client; one of no known kind is logged whole."""
+        if not isinstance(error, ServiceError):
+            log.error("fault", protocol="grpc", method=self._method, exc_info=error)
+            error = ServiceError(ErrorKind.INTERNAL, "a fault of the service; its log has more")
+        self.code = error.codes.grpc
+        return error
+
+
+def _checked(request: Any) -> Any:
+    if isinstance(request, _Malformed):
+        raise ServiceError(
+            ErrorKind.MALFORMED, f"the request is not a message of the contract: {request.reason}"
+        )
+    return request
+
+
+async def _all_checked(requests: AsyncIterator[Any]) -> AsyncIterator[Any]:
+    async for request in requests:
+        yield _checked(request)

@@ -1,0 +1,131 @@
+"""The OpenAPI description, and ``/docs``: Swagger UI from our own host, no other.
+
+The page's script and style come from the package ``fastapi-offline``; a content security
+policy holds the browser to this host.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+from starlette.responses import RedirectResponse, Response
+from starlette.staticfiles import StaticFiles
+
+from trajectron_service.http_errors import PROBLEM_JSON, Problem
+from trajectron_service.http_schemas import (
+    CreateSessionRequest,
+    ObserveRequest,
+    PredictRequest,
+    PredictSessionRequest,
+)
+
+_ASSETS_PATH = "/docs/assets"
+_REF = "#/components/schemas/{model}"
+_BODIES: tuple[type[BaseModel], ...] = (
+    PredictRequest,
+    CreateSessionRequest,
+    ObserveRequest,
+    PredictSessionRequest,
+    Problem,
+)
+_RETRY_AFTER = {
+    "Retry-After": {
+        "description": "Seconds until a retry is worth it.",
+        "schema": {"type": "integer", "minimum": 1},
+    }
+}
+_ERRORS: dict[int, str] = {
+    400: "The body is not valid JSON.",
+    404: "No such session, model or agent, as `reason` says.",
+    409: "The session's state forbids it: `reason` is SESSION_EXISTS, FRAME_CONFLICT, "
+    "FRAME_OUT_OF_ORDER or NO_FRAMES.",
+    413: "The body is too large.",
+    422: "A field is missing, mistyped, unknown or out of range: `violations` names it.",
+    429: "The queue or the service is full; try again later.",
+    500: "A fault of the service; its log has more under the answer's X-Request-Id.",
+    503: "The service is starting or draining; try again, here or elsewhere.",
+    504: "Not done before the deadline.",
+}
+_INTRODUCTION = """
+Watches scenes of moving agents and foretells the distribution of where each of them goes next.
+
+**Units:** metres and seconds. Positions are in your own world-fixed, right-handed frame; nothing
+is re-centred. **Forecasts** carry absolute positions here; with `Accept: application/x-protobuf`
+the answer is the message of the gRPC API (`trajectron.v1`), whose arrays are offsets from each
+agent's last position. **Errors** are RFC 9457 problems (`application/problem+json`).
+"""
+
+
+def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The descriptions of a route's error answers; every route can also answer 500."""
+    return {
+        status: {
+            "description": _ERRORS[status],
+            "content": {PROBLEM_JSON: {"schema": {"$ref": _REF.format(model="Problem")}}},
+            **({"headers": _RETRY_AFTER} if status in (429, 503) else {}),
+        }
+        for status in (*statuses, 500)
+    }
+
+
+def takes(body: type[BaseModel], *, required: bool = True) -> dict[str, Any]:
+    """The description of a route's body, which it reads itself (within a limit)."""
+    schema = {"$ref": _REF.format(model=body.__name__)}
+    content = {"application/json": {"schema": schema}}
+    return {"requestBody": {"required": required, "content": content}}
+
+
+def add_docs(app: FastAPI, version: str) -> None:
+    """Adds ``/openapi.json`` and ``/docs`` to an application that has neither."""
+    described: dict[str, Any] = {}
+
+    def openapi() -> dict[str, Any]:
+        if not described:
+            described.update(_describe(app, version))
+        return described
+
+    app.openapi = openapi  # type: ignore[method-assign]  # fastapi's documented way
+    static = resources.files("fastapi_offline") / "static"
+    app.mount(_ASSETS_PATH, StaticFiles(directory=str(static)))
+    app.add_api_route("/docs", _page, include_in_schema=False)
+    app.add_api_route("/", _to_docs, include_in_schema=False)
+
+
+def _describe(app: FastAPI, version: str) -> dict[str, Any]:
+    description = get_openapi(
+        title="Trajectron", version=version, description=_INTRODUCTION, routes=app.routes
+    )
+    _, definitions = models_json_schema(
+        [(body, "validation") for body in _BODIES], ref_template=_REF
+    )
+    schemas = description.setdefault("components", {}).setdefault("schemas", {})
+    for name, schema in definitions["$defs"].items():
+        schemas.setdefault(name, schema)
+    return description
+
+
+async def _page() -> Response:
+    page = get_swagger_ui_html(
+        openapi_url="/openapi.json",
+        title="Trajectron",
+        swagger_js_url=f"{_ASSETS_PATH}/swagger-ui-bundle.js",
+        swagger_css_url=f"{_ASSETS_PATH}/swagger-ui.css",
+        swagger_favicon_url="data:,",
+        # The default validator is a foreign host.
+        swagger_ui_parameters={"validatorUrl": None},
+    )
+    page.headers["Content-Security-Policy"] = (
+        "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data:"
+    )
+    return page
+
+
+async def _to_docs() -> Response:
+    return RedirectResponse("/docs")

@@ -1,0 +1,96 @@
+"""What every HTTP request goes through: an id, a log line, a measurement, a last safety net."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from structlog.contextvars import bound_contextvars
+
+from trajectron_service import logs
+from trajectron_service.errors import ErrorKind, ServiceError
+from trajectron_service.http_errors import problem_response
+from trajectron_service.metrics import Metrics
+
+REQUEST_ID = "X-Request-Id"
+# Probes and scrapes come all the time and say nothing.
+_QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
+# Ids of clients go into our log: short, and of letters that cannot forge a line.
+_ID = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
+
+log = logs.get(__name__)
+
+
+class RequestMiddleware:
+    """Pure ASGI, so that a client's hanging up still reaches the routes.
+
+    Args:
+        app: what answers.
+        metrics: where durations go, by the route's template and not by its path.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI's entry."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        sender = _Sender(send, _request_id(scope))
+        start = time.perf_counter()
+        with bound_contextvars(request_id=sender.request_id):
+            try:
+                await self._app(scope, receive, sender)
+            except Exception:
+                log.exception("fault", protocol="http", path=scope["path"])
+                await sender.fail(scope, receive)
+            finally:
+                self._note(scope, sender.status, time.perf_counter() - start)
+
+    def _note(self, scope: Scope, status: int, duration_s: float) -> None:
+        template = getattr(scope.get("route"), "path", "unknown")
+        method = f"{scope['method']} {template}"
+        self._metrics.request("http", method, str(status), duration_s)
+        if template not in _QUIET:
+            log.info(
+                "call",
+                protocol="http",
+                method=method,
+                path=scope["path"],
+                code=status,
+                duration_s=duration_s,
+            )
+
+
+class _Sender:
+    """Sends an answer with the request's id, and remembers its status."""
+
+    def __init__(self, send: Send, request_id: str) -> None:
+        self.request_id = request_id
+        self.status = 499  # until an answer starts: the client has gone
+        self._send = send
+        self._started = False
+
+    async def __call__(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self._started = True
+            self.status = message["status"]
+            MutableHeaders(scope=message)[REQUEST_ID] = self.request_id
+        await self._send(message)
+
+    async def fail(self, scope: Scope, receive: Receive) -> None:
+        """Answers 500 unless an answer has begun, which then just breaks off."""
+        if self._started:
+            return
+        error = ServiceError(ErrorKind.INTERNAL, "a fault of the service; its log has more")
+        await problem_response(error)(scope, receive, self)
+
+
+def _request_id(scope: Scope) -> str:
+    given = Headers(scope=scope).get(REQUEST_ID, "")
+    return given if _ID.fullmatch(given) else uuid.uuid4().hex

@@ -1,0 +1,171 @@
+"""Which path leads where: the fastapi application."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from trajectron_service import http_answers as answers
+from trajectron_service import http_errors
+from trajectron_service.application import Application
+from trajectron_service.errors import ServiceError
+from trajectron_service.health import Health, Phase
+from trajectron_service.http_api import PROTOBUF, HttpApi, json_response
+from trajectron_service.http_docs import add_docs, errors, takes
+from trajectron_service.http_middleware import RequestMiddleware
+from trajectron_service.http_schemas import (
+    CreateSessionRequest,
+    ObserveRequest,
+    PredictRequest,
+    PredictSessionRequest,
+)
+from trajectron_service.metrics import CONTENT_TYPE, Metrics
+
+_BINARY: dict[str, Any] = {
+    "content": {PROTOBUF: {"schema": {"type": "string", "format": "binary"}}}
+}
+
+
+def http_app(
+    application: Application, health: Health, metrics: Metrics, *, max_body_bytes: int, version: str
+) -> FastAPI:
+    """Everything that is served over HTTP.
+
+    Args:
+        application: the core.
+        health: what ``/readyz`` tells.
+        metrics: what ``/metrics`` tells.
+        max_body_bytes: larger bodies are refused while they are read.
+        version: of the distribution, for the OpenAPI page.
+    """
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
+    app.add_middleware(RequestMiddleware, metrics=metrics)
+    app.add_exception_handler(ServiceError, http_errors.on_service_error)
+    app.add_exception_handler(HTTPException, http_errors.on_http_exception)
+    app.add_exception_handler(RequestValidationError, http_errors.on_invalid_parameters)
+    api = HttpApi(application, max_body_bytes)
+    app.include_router(_predictions(api))
+    app.include_router(_sessions(api))
+    app.include_router(_operations(health, metrics))
+    add_docs(app, version)
+    return app
+
+
+def _predictions(api: HttpApi) -> APIRouter:
+    router = APIRouter(tags=["predictions"])
+    for path in ("/v1/predict", "/predict"):
+        router.add_api_route(
+            path,
+            api.predict,
+            methods=["POST"],
+            summary="Predict" + (" (short path)" if path == "/predict" else ""),
+            operation_id="predict" + ("_short" if path == "/predict" else ""),
+            response_model=answers.Forecast,
+            responses={200: _BINARY, **errors(400, 404, 413, 422, 429, 503, 504)},
+            openapi_extra=takes(PredictRequest),
+        )
+    router.add_api_route(
+        "/v1/models",
+        api.list_models,
+        methods=["GET"],
+        summary="List models",
+        operation_id="list_models",
+        response_model=answers.Models,
+        responses={200: _BINARY, **errors()},
+    )
+    return router
+
+
+def _sessions(api: HttpApi) -> APIRouter:
+    router = APIRouter(tags=["sessions"])
+    router.add_api_route(
+        "/v1/sessions",
+        api.create_session,
+        methods=["POST"],
+        status_code=201,
+        summary="Create a session",
+        operation_id="create_session",
+        response_model=answers.Session,
+        responses={201: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503)},
+        openapi_extra=takes(CreateSessionRequest, required=False),
+    )
+    router.add_api_route(
+        "/v1/sessions",
+        api.list_sessions,
+        methods=["GET"],
+        summary="List sessions",
+        operation_id="list_sessions",
+        response_model=answers.Sessions,
+        responses={200: _BINARY, **errors(422)},
+    )
+    router.add_api_route(
+        "/v1/sessions/{session_id}:observe",
+        api.observe,
+        methods=["POST"],
+        summary="Observe frames",
+        operation_id="observe",
+        response_model=answers.FrameResults,
+        responses={200: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        openapi_extra=takes(ObserveRequest),
+    )
+    router.add_api_route(
+        "/v1/sessions/{session_id}:predict",
+        api.predict_session,
+        methods=["POST"],
+        summary="Predict from a session",
+        operation_id="predict_session",
+        response_model=answers.Forecast,
+        responses={200: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        openapi_extra=takes(PredictSessionRequest, required=False),
+    )
+    router.add_api_route(
+        "/v1/sessions/{session_id}",
+        api.get_session,
+        methods=["GET"],
+        summary="Get a session and its graph",
+        operation_id="get_session",
+        response_model=answers.SessionWithGraph,
+        responses={200: _BINARY, **errors(404, 422)},
+    )
+    router.add_api_route(
+        "/v1/sessions/{session_id}",
+        api.delete_session,
+        methods=["DELETE"],
+        status_code=204,
+        summary="Delete a session",
+        operation_id="delete_session",
+        responses=errors(404, 422),
+    )
+    return router
+
+
+def _operations(health: Health, metrics: Metrics) -> APIRouter:
+    router = APIRouter(tags=["operations"])
+
+    @router.get("/healthz", response_model=answers.Status, operation_id="healthz")
+    async def is_alive() -> Response:
+        """Whether the process lives."""
+        return json_response({"status": "ok"})
+
+    @router.get(
+        "/readyz",
+        response_model=answers.Status,
+        operation_id="readyz",
+        responses={503: {"model": answers.Status, "description": "Starting or draining."}},
+    )
+    async def is_ready() -> Response:
+        """Whether work is welcome: models loaded, warmed up, not draining."""
+        ready = health.phase is Phase.READY
+        status = "ok" if ready else health.phase.value
+        return json_response({"status": status}, 200 if ready else 503)
+
+    @router.get("/metrics", operation_id="metrics", response_class=Response)
+    async def measurements() -> Response:
+        """Gives metrics in the Prometheus text format."""
+        return Response(metrics.render(), media_type=CONTENT_TYPE)
+
+    return router
