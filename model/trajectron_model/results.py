@@ -158,7 +158,7 @@ class Evaluation:
             columns = [_metrics(scores) for scores in (*(one.scores for one in row.sets), row.mean)]
             name = row.name + IN_SAMPLE_MARK * row.in_sample
             lines = list(zip(*columns, strict=True))
-            if all(error == lines[0][n][1] for line in lines for n, (_, error) in enumerate(line)):
+            if len({tuple(str(error) for _, error in line) for line in lines}) == 1:
                 # A predictor without spread: every metric is that of its one trajectory.
                 lines = [tuple(("one trajectory", error) for _, error in lines[0])]
             for line in lines:
