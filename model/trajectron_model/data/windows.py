@@ -94,13 +94,12 @@ def sgan_windows(
     start, agent = _stretches(recording, length)
     order = np.lexsort((agent, start))
     start, agent = start[order], agent[order]
-    firsts, begin = np.unique(start, return_index=True)
-    end = np.append(begin[1:], len(start))
-    windows = zip(firsts.tolist(), begin.tolist(), end.tolist(), strict=True)
+    firsts, begins, counts = np.unique(start, return_index=True, return_counts=True)
+    windows = zip(firsts.tolist(), begins.tolist(), counts.tolist(), strict=True)
     return [
-        Window(recording, first, observed, horizon, agent[low:high])
-        for first, low, high in windows
-        if high - low >= min_agents
+        Window(recording, first, observed, horizon, agent[begin : begin + count])
+        for first, begin, count in windows
+        if count >= min_agents
     ]
 
 

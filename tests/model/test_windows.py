@@ -1,0 +1,127 @@
+"""Windows: on a scene drawn by hand, and the published counts on the real recordings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trajectron_model.data.eth_ucy import EthUcy
+from trajectron_model.data.recording import Recording
+from trajectron_model.data.windows import PROTOCOLS, Window, batches, sgan_windows
+
+# Who is there at each of eight steps; windows below are of 2 observed and 2 further steps.
+PRESENCE = {
+    "whole": "########",
+    "early": "#####...",
+    "gap": "####.###",
+    "brief": ".##.....",
+}
+
+
+def scene(presence: dict[str, str]) -> Recording:
+    """Agents at x = step, y = their number, where their line has a mark."""
+    rows = [
+        (step, agent, float(step), float(agent))
+        for agent, line in enumerate(presence.values())
+        for step, mark in enumerate(line)
+        if mark == "#"
+    ]
+    table = np.array(rows)
+    return Recording.from_rows(
+        name="scene",
+        dt_s=0.4,
+        start_time_s=0.0,
+        ids=list(presence),
+        types=["pedestrian"] * len(presence),
+        step=table[:, 0].astype(np.int64),
+        agent=table[:, 1].astype(np.int64),
+        position=table[:, 2:],
+        num_steps=len(next(iter(presence.values()))),
+    )
+
+
+def cut(presence: dict[str, str], min_agents: int) -> dict[int, tuple[str, ...]]:
+    """The judged agents by first step of the windows of 2 + 2 steps."""
+    windows = sgan_windows(scene(presence), observed=2, horizon=2, min_agents=min_agents)
+    return {window.first: window.ids for window in windows}
+
+
+def test_judged_are_those_present_in_all_steps() -> None:
+    assert cut(PRESENCE, min_agents=1) == {
+        0: ("whole", "early", "gap"),
+        1: ("whole", "early"),
+        2: ("whole",),
+        3: ("whole",),
+        4: ("whole",),
+    }
+
+
+def test_a_window_needs_enough_judged_agents() -> None:
+    assert cut(PRESENCE, min_agents=2).keys() == {0, 1}
+    assert cut(PRESENCE, min_agents=4) == {}
+
+
+def test_frames_are_the_observed_steps_with_everyone_in_them() -> None:
+    (window, *_) = sgan_windows(scene(PRESENCE), observed=2, horizon=2)
+    frames = window.frames()
+    assert [frame.ids for frame in frames] == [
+        ("whole", "early", "gap"),
+        ("whole", "early", "gap", "brief"),
+    ]
+    assert [frame.time_s for frame in frames] == [0.0, 0.4]
+
+
+def test_history_and_future_are_the_judged_agents_positions() -> None:
+    window = sgan_windows(scene(PRESENCE), observed=2, horizon=2)[1]
+    assert (window.first, window.now) == (1, 2)
+    assert window.history().tolist() == [
+        [[1.0, 0.0], [2.0, 0.0]],
+        [[1.0, 1.0], [2.0, 1.0]],
+    ]
+    assert window.future()[0].tolist() == [[3.0, 0.0], [4.0, 0.0]]
+
+
+def test_an_absent_agent_has_no_position() -> None:
+    window = Window(scene(PRESENCE), 0, 2, 2, np.array([3]))
+    assert np.isnan(window.history()[0, 0]).all()
+    assert window.history()[0, 1].tolist() == [1.0, 3.0]
+
+
+def test_recordings_shorter_than_a_window_have_none() -> None:
+    assert cut({"a": "###", "b": "###"}, min_agents=2) == {}
+
+
+def test_batches_hold_all_windows_in_order() -> None:
+    windows = sgan_windows(scene(PRESENCE), observed=2, horizon=2, min_agents=1)
+    sizes = [[len(window.judged) for window in batch] for batch in batches(windows, 3)]
+    assert sizes == [[3], [2, 1], [1, 1]]
+    assert [len(batch) for batch in batches(windows, 1)] == [1] * 5
+    assert list(batches([], 3)) == []
+
+
+COUNTS = {
+    ("sgan", "eth"): (70, 181),
+    ("sgan", "hotel"): (301, 1053),
+    ("sgan", "univ"): (947, 24334),
+    ("sgan", "zara1"): (602, 2253),
+    ("sgan", "zara2"): (921, 5833),
+    ("all", "eth"): (253, 364),
+    ("all", "hotel"): (445, 1197),
+    ("all", "univ"): (947, 24334),
+    ("all", "zara1"): (705, 2356),
+    ("all", "zara2"): (998, 5910),
+}
+
+
+@pytest.mark.parametrize(("protocol", "test_set"), COUNTS)
+def test_the_published_counts_are_met(eth_ucy: EthUcy, protocol: str, test_set: str) -> None:
+    windows = PROTOCOLS[protocol].windows(eth_ucy.test(test_set))
+    counts = (len(windows), sum(len(window.judged) for window in windows))
+    assert counts == COUNTS[protocol, test_set]
+
+
+def test_real_windows_are_whole(eth_ucy: EthUcy) -> None:
+    for window in PROTOCOLS["sgan"].windows(eth_ucy.test("hotel")):
+        assert np.isfinite(window.history()).all()
+        assert np.isfinite(window.future()).all()
+        assert set(window.ids) <= set(window.frames()[-1].ids)
