@@ -1,0 +1,1 @@
+"""Training: examples from recordings, objectives, the loop, and what it can resume from."""

@@ -1,0 +1,145 @@
+"""What training minimises, from the exact likelihood under every latent value.
+
+The beta-weighted ELBO (paper, equation 2; Higgins et al. 2017), and the exact marginal
+likelihood that it bounds. With a discrete z both are sums, nothing is sampled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trajectron_model.features import to_frame
+from trajectron_model.forecast import start_velocity
+from trajectron_model.latent import categorical_kl
+from trajectron_model.node_model import Likelihood
+from trajectron_model.training.examples import Batch
+from trajectron_model.trajectron import Trajectron, rows_by_type
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings:
+    """Which objective, and how it is weighted.
+
+    Attributes:
+        name: ``elbo``: E_q[log p(y|x,z)] - beta KL(q || p). ``marginal``: log sum_z p(z|x)
+            p(y|x,z), with the recognition network fitted to the exact posterior beside it.
+        beta_start, beta_end: beta at the first step and from ``beta_steps`` of the training on.
+        beta_ramp: share of the training over which beta goes from start to end.
+        label_noise_mps: standard deviation of noise on true velocities. Recorded tracks are
+            smooth splines: without it the mixture spends itself on exactly equal velocities.
+    """
+
+    name: Literal["elbo", "marginal"] = "elbo"
+    beta_start: float = 1.0
+    beta_end: float = 1.0
+    beta_ramp: float = 0.0
+    label_noise_mps: float = 0.05
+
+    def beta(self, progress: float) -> float:
+        """beta at a share of the training in [0, 1]."""
+        share = 1.0 if self.beta_ramp <= 0.0 else min(progress / self.beta_ramp, 1.0)
+        return self.beta_start + (self.beta_end - self.beta_start) * share
+
+
+class LossTerms(NamedTuple):
+    """Means over agents, in nats of a whole future; ``loss`` is what is minimised, per step."""
+
+    loss: Tensor
+    nll: Tensor  # exact: -log sum_z p(z|x) p(y|x,z)
+    reconstruction: Tensor  # -E_q[log p(y|x,z)]
+    kl: Tensor  # KL(q || p)
+    prior_entropy: Tensor
+    information: Tensor  # entropy of the mean prior less the mean entropy: how much x says of z
+
+
+def loss_terms(
+    model: Trajectron,
+    batch: Batch,
+    settings: ObjectiveSettings,
+    *,
+    beta: float,
+    random: np.random.Generator,
+) -> LossTerms:
+    """The loss of a batch, with gradients.
+
+    Args:
+        model: in training mode.
+        batch: examples.
+        settings: the objective.
+        beta: weight of the divergence at this step.
+        random: of the label noise, and of the frames of agents without a heading.
+    """
+    parts = [
+        (part, part.steps.shape[0])
+        for part in _likelihoods(model, batch, settings.label_noise_mps, random)
+    ]
+    agents = sum(count for _, count in parts)
+    terms = [_terms(part, settings.name, beta) for part, _ in parts]
+    weights = [count / agents for _, count in parts]
+    total = [
+        torch.stack([w * value for w, value in zip(weights, column, strict=True)]).sum()
+        for column in zip(*terms, strict=True)
+    ]
+    return LossTerms(*total)
+
+
+def _terms(part: Likelihood, name: str, beta: float) -> LossTerms:
+    log_prob, log_prior, log_q = part.log_prob, part.log_prior, part.log_recognition
+    nll = -torch.logsumexp(log_prior + log_prob, dim=-1)
+    reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)
+    kl = categorical_kl(log_q, log_prior)
+    if name == "marginal":
+        posterior = torch.log_softmax(log_prior + log_prob, dim=-1).detach()
+        objective = nll + categorical_kl(posterior, log_q)
+    else:
+        objective = reconstruction + beta * kl
+    entropy = -(log_prior.exp() * log_prior).sum(dim=-1)
+    mean_prior = log_prior.exp().mean(dim=0)
+    information = -(mean_prior * mean_prior.clamp_min(1e-12).log()).sum() - entropy.mean()
+    # A common scale whatever the horizon: nats a step, all agents weighing the same.
+    loss = objective.mean() / part.steps.float().mean()
+    return LossTerms(
+        loss, *(v.mean().detach() for v in (nll, reconstruction, kl, entropy)), information.detach()
+    )
+
+
+def _likelihoods(
+    model: Trajectron, batch: Batch, label_noise_mps: float, random: np.random.Generator
+) -> list[Likelihood]:
+    """One for each type in the batch."""
+    device = model.device
+    encoded = model.encode(batch.past, batch.rows)
+    last = encoded.motion.position.unsqueeze(1)  # [B, 1, 2]
+    track = torch.cat([last, torch.from_numpy(batch.future).to(device)], dim=1)
+    velocity = (track.diff(dim=1) / model.config.dt_s).float()  # [B, H, 2] m/s
+    noise = random.normal(0.0, label_noise_mps, velocity.shape).astype(np.float32)
+    velocity = velocity + torch.from_numpy(noise).to(device)
+    # Without a heading no direction is special: each draws a frame of its own.
+    angle = random.uniform(0.0, 2.0 * math.pi, len(batch.rows)).astype(np.float32)
+    any_axis = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle)], axis=-1)).to(device)
+    axis = model.features.frame(encoded.motion)
+    if model.features.isotropic_without_heading:
+        axis = torch.where(encoded.motion.heading_known.unsqueeze(-1), axis, any_axis)
+    future = to_frame(velocity, axis.unsqueeze(1))
+    known = torch.from_numpy(batch.known).to(device)
+    found = []
+    for kind, index in rows_by_type(encoded.node_type):
+        scale = model.config.types[kind].speed_scale_mps
+        motion = type(encoded.motion)(*(column[index] for column in encoded.motion))
+        scaled = future[index] / scale
+        found.append(
+            model.node_model(kind).likelihood(
+                encoded.encoding[index],
+                start_velocity(model, motion, kind),
+                scaled,
+                known[index],
+                scaled,
+            )
+        )
+    return found
