@@ -1,7 +1,7 @@
 """Checks the links of the documentation: every relative target and heading must exist.
 
 Links to other sites are not fetched, so that the check needs no network; only their
-form is looked at.
+form is looked at. Usage: ``links.py [ROOT]``, this repository by default.
 """
 
 from __future__ import annotations
@@ -66,9 +66,10 @@ def fault(document: Path, target: str) -> str | None:
 
 def main() -> int:
     """Prints each broken link as ``FILE: target reason``; returns the exit status."""
+    root = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else ROOT
     faults = [
-        f"{document.relative_to(ROOT)}: {target} {reason}"
-        for document in documents(ROOT)
+        f"{document.relative_to(root)}: {target} {reason}"
+        for document in documents(root)
         for target in links(document.read_text(encoding="utf-8"))
         if (reason := fault(document, target))
     ]
