@@ -169,7 +169,7 @@ def judge(
     samples: int,
     seed: int,
     best_of: Sequence[int] = BEST_OF,
-    progress: Callable[[int], None] = lambda windows: None,
+    progress: Callable[[int], object] = lambda windows: None,
 ) -> AgentErrors:
     """The errors of a predictor on windows, in the windows' order; memory stays bounded.
 
@@ -198,7 +198,7 @@ def evaluate(
     samples: int = 100,
     seed: int = 0,
     in_sample: bool = False,
-    progress: Callable[[int], None] = lambda windows: None,
+    progress: Callable[[int], object] = lambda windows: None,
 ) -> Evaluation:
     """Judges every entry on the windows of every test set.
 

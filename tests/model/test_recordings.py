@@ -26,7 +26,13 @@ def recording(rows: list[tuple[int, int, float, float]], num_steps: int | None =
     )
 
 
-CROSSING = [(2, 1, 5.0, 0.0), (0, 0, 0.0, 0.0), (2, 0, 2.0, 0.0), (1, 0, 1.0, 0.0), (4, 1, 3.0, 0.0)]
+CROSSING = [
+    (2, 1, 5.0, 0.0),
+    (0, 0, 0.0, 0.0),
+    (2, 0, 2.0, 0.0),
+    (1, 0, 1.0, 0.0),
+    (4, 1, 3.0, 0.0),
+]
 
 
 def test_rows_are_sorted_by_step_then_agent() -> None:
@@ -62,9 +68,7 @@ def test_a_part_counts_its_steps_anew_and_drops_who_is_not_in_it() -> None:
 def test_dense_arrays_are_nan_where_an_agent_is_absent() -> None:
     agents, positions = recording(CROSSING).dense(1, 4)
     assert agents.tolist() == [0, 1]
-    np.testing.assert_array_equal(
-        positions[..., 0], [[1.0, np.nan], [2.0, 5.0], [np.nan, np.nan]]
-    )
+    np.testing.assert_array_equal(positions[..., 0], [[1.0, np.nan], [2.0, 5.0], [np.nan, np.nan]])
     assert recording(CROSSING).dense()[1].shape == (5, 2, 2)
 
 
