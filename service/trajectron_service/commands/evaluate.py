@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import enum
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -19,13 +18,6 @@ if TYPE_CHECKING:
     from trajectron_model.results import Evaluation
 
 LEAVE_ONE_OUT = "eth_ucy-without-{test_set}"
-
-
-class ProtocolName(enum.StrEnum):
-    """Which windows are judged."""
-
-    SGAN = "sgan"
-    ALL = "all"
 
 
 def evaluate(
@@ -54,12 +46,12 @@ def evaluate(
         ),
     ] = False,
     protocol: Annotated[
-        ProtocolName,
+        Literal["sgan", "all"],
         typer.Option(
             help="`sgan`: windows of 8 observed and 12 further steps with at least two people "
             "present throughout; `all`: one suffices."
         ),
-    ] = ProtocolName.SGAN,
+    ] = "sgan",
     samples: Annotated[
         int, typer.Option(min=1, max=2000, help="Independent futures drawn for each agent.")
     ] = 100,
@@ -90,7 +82,7 @@ def evaluate(
     names = [test_set.name for test_set in test_sets]
     models = list(dict.fromkeys(model or ()))
     entries = _entries(names, models, leave_one_out or not models)
-    result = _judged(entries, test_sets, protocol.value, samples, seed, in_sample)
+    result = _judged(entries, test_sets, protocol, samples, seed, in_sample)
     out.print(_heading(result), end="\n\n")
     out.print(result.to_markdown(), markup=False)
     if json_file is not None:
