@@ -1,0 +1,1 @@
+"""The prediction service: sessions, batching, HTTP and gRPC around the Trajectron."""

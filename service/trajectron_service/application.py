@@ -1,0 +1,415 @@
+"""The use cases: what the service does, whatever transport asked for it.
+
+Everything raised here is a ``ServiceError``. Deadlines are seconds on ``time.monotonic()``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import time
+import weakref
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
+
+from trajectron_service import choices as chosen
+from trajectron_service import logs
+from trajectron_service.batching import Batcher, BatchReport
+from trajectron_service.choices import Choices
+from trajectron_service.errors import ErrorKind, ServiceError, invalid
+from trajectron_service.forecaster import Forecaster, FrameAnswer, FrameRequest
+from trajectron_service.messages import (
+    Forecast,
+    ForecastOptions,
+    Frame,
+    FrameResult,
+    ModelInfo,
+    SceneGraph,
+    SessionConfig,
+    SessionInfo,
+    StreamOptions,
+    UnknownTypes,
+)
+from trajectron_service.metrics import Metrics
+from trajectron_service.records import SceneRecord
+from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
+from trajectron_service.sessions import Change, Sessions
+from trajectron_service.settings import Settings
+from trajectron_service.stores import SessionKey, SessionStore
+from trajectron_service.stores.memory import MemoryStore
+from trajectron_service.streams import Stream, StreamLimits
+from trajectron_service.timebase import Timeline
+
+__all__ = ["Application", "Stream"]
+
+log = logs.get(__name__)
+
+# The only tenant until there are tokens.
+TENANT = "default"
+DEFAULT_PAGE = 100
+LARGEST_PAGE = 1000
+HOUSEKEEPING_S = 1.0
+
+
+def steady_unix_clock() -> Callable[[], float]:
+    """Unix seconds that go on steadily whatever happens to the system's clock."""
+    offset = time.time() - time.monotonic()
+    return lambda: time.monotonic() + offset
+
+
+class Application:
+    """The service without a transport. Made inside a running event loop's program, used in it.
+
+    Args:
+        settings: limits and defaults.
+        engine: the loaded models.
+        metrics: told about everything.
+        store: where sessions are kept; this process's memory when None.
+        clock: Unix seconds that never go back: when sessions expire.
+        draw_seed: gives the seed of a request that brings none.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        engine: SceneEngine,
+        metrics: Metrics,
+        *,
+        store: SessionStore | None = None,
+        clock: Callable[[], float] | None = None,
+        draw_seed: Callable[[], int] = chosen.draw_seed,
+    ) -> None:
+        self._settings = settings
+        self._engine = engine
+        self._metrics = metrics
+        self._clock = clock or steady_unix_clock()
+        self._choices = Choices(settings, engine.models, engine.default_model, draw_seed)
+        self._batcher = Batcher[SceneJob, SceneResult](
+            engine.run,
+            queue_size=settings.queue_size,
+            max_batch_cost=settings.max_batch_points,
+            report=self._note_batch,
+        )
+        self._forecaster = Forecaster(self._choices, self._batcher, metrics)
+        self._sessions = Sessions(
+            store or MemoryStore(),
+            self._forecaster.packed,
+            clock=self._clock,
+            metrics=metrics,
+            max_sessions=settings.max_sessions,
+            park_after_s=settings.park_after_s,
+        )
+        self._streams: weakref.WeakValueDictionary[SessionKey, Stream] = (
+            weakref.WeakValueDictionary()
+        )
+        self._started = False
+        self._draining = False
+        self._in_hand = 0
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._housekeeper: asyncio.Task[None] | None = None
+        for facts in engine.models.values():
+            info = facts.info
+            metrics.model_info.labels(info.name, info.hash, str(info.is_default).lower()).set(1)
+        metrics.queue_length.set_function(lambda: self._batcher.waiting)
+        metrics.ready.set_function(lambda: float(self.ready))
+
+    async def start(self) -> None:
+        """Warms the models up and begins to close idle sessions; then ``ready`` is true."""
+        if self._settings.warm_up:
+            await asyncio.to_thread(self._engine.warm_up)
+        self._housekeeper = asyncio.create_task(self._keep_house(), name="housekeeper")
+        self._started = True
+
+    @property
+    def ready(self) -> bool:
+        """Whether new work is taken."""
+        return self._started and not self._draining
+
+    def begin_drain(self) -> None:
+        """Refuses new work from now on; work in hand finishes, streams end after what they read."""
+        self._draining = True
+        for stream in list(self._streams.values()):
+            stream.drain()
+
+    async def drained(self) -> None:
+        """Returns when no work is in hand."""
+        await self._idle.wait()
+
+    async def close(self) -> None:
+        """Ends the housekeeping and, after what waits there, the inference thread."""
+        self._draining = True
+        if self._housekeeper is not None:
+            self._housekeeper.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._housekeeper
+        await self._batcher.close()
+
+    def list_models(self) -> tuple[ModelInfo, ...]:
+        """The loaded models, the default one first."""
+        infos = [facts.info for facts in self._engine.models.values()]
+        return tuple(sorted(infos, key=lambda info: not info.is_default))
+
+    async def predict(
+        self,
+        *,
+        model: str | None,
+        frames: tuple[Frame, ...],
+        options: ForecastOptions,
+        unknown_types: UnknownTypes,
+        type_map: Mapping[str, str],
+        frame_interval_s: float | None,
+        deadline: float | None,
+    ) -> Forecast:
+        """The futures after ``frames``: what a session that observed them would forecast."""
+        with self._work():
+            self._check_frames(frames)
+            self._choices.check_options(options)
+            asked = SessionConfig(
+                model=model,
+                frame_interval_s=frame_interval_s,
+                unknown_types=unknown_types,
+                type_map=type_map,
+            )
+            requests = [FrameRequest(frame) for frame in frames[:-1]]
+            requests.append(FrameRequest(frames[-1], options))
+            async with self._until(deadline) as limit:
+                _, _, answers = await self._forecaster.fold(
+                    self._blank(asked), requests, deadline=limit, strict=True
+                )
+        forecast = answers[-1].forecast
+        assert forecast is not None  # strict: else it has raised
+        return forecast
+
+    async def create_session(self, session_id: str | None, config: SessionConfig) -> SessionInfo:
+        """Opens a session; an id is assigned when None or empty."""
+        with self._work():
+            key = _key(chosen.session_id(session_id))
+            return await self._sessions.create(key, self._blank(config))
+
+    async def get_session(self, session_id: str) -> tuple[SessionInfo, SceneGraph]:
+        """A session with its graph at the newest frame."""
+        key = _key(session_id)
+
+        async def look(record: SceneRecord) -> tuple[Change, SceneGraph]:
+            after, graph = await self._forecaster.graph(record, key=key, deadline=limit)
+            return Change(after), graph
+
+        with self._work():
+            async with self._until(None) as limit:
+                graph = await self._sessions.change(key, look)
+                return await self._sessions.info(key), graph
+
+    async def list_sessions(
+        self, page_size: int | None, page_token: str
+    ) -> tuple[tuple[SessionInfo, ...], str]:
+        """Open sessions in order of id, and the token of the next page, empty on the last."""
+        with self._work():
+            if page_size is not None and not 1 <= page_size <= LARGEST_PAGE:
+                raise invalid("page_size", f"is {page_size}; must be 1 to {LARGEST_PAGE}")
+            after = _read_token(page_token)
+            infos, more = await self._sessions.page(TENANT, after, page_size or DEFAULT_PAGE)
+            return infos, _write_token(infos[-1].id) if more and infos else ""
+
+    async def delete_session(self, session_id: str) -> None:
+        """Closes a session and forgets its state."""
+        with self._work():
+            await self._sessions.delete(_key(session_id))
+
+    async def observe(
+        self, session_id: str, frames: tuple[Frame, ...], deadline: float | None
+    ) -> tuple[FrameResult, ...]:
+        """Folds frames in order; a refused one leaves the others. A single refused one raises."""
+        requests = [FrameRequest(frame) for frame in frames]
+        with self._work():
+            self._check_frames(frames)
+            async with self._until(deadline) as limit:
+                answers = await self._fold(
+                    _key(session_id), requests, limit, strict=len(frames) == 1
+                )
+        return tuple(answer.result for answer in answers)
+
+    async def predict_session(
+        self, session_id: str, options: ForecastOptions, deadline: float | None
+    ) -> Forecast:
+        """The futures from the session's newest frame."""
+        key = _key(session_id)
+
+        async def look(record: SceneRecord) -> tuple[Change, Forecast]:
+            after, forecast = await self._forecaster.forecast(
+                record, options, key=key, deadline=limit
+            )
+            return Change(after), forecast
+
+        with self._work():
+            self._choices.check_options(options)
+            async with self._until(deadline) as limit:
+                return await self._sessions.change(key, look)
+
+    async def open_stream(
+        self, session_id: str | None, config: SessionConfig, options: StreamOptions
+    ) -> Stream:
+        """A stream into a session, new or resumed; another stream into it ends."""
+        with self._work():
+            if options.forecast is not None:
+                self._choices.check_options(options.forecast)
+            session, resumed = await self._open(session_id, config)
+            key = _key(session.id)
+            before = self._streams.get(key)
+            if before is not None:
+                await before.take_over()
+                session = await self._sessions.info(key)
+            stream = Stream(
+                session,
+                resumed,
+                options,
+                fold=lambda requests, deadline: self._fold(key, requests, deadline),
+                on_end=lambda: self._sessions.delete(key, "stream_ended"),
+                busy=self._work,
+                limits=StreamLimits(
+                    self._settings.stream_window,
+                    self._settings.max_batch_points,
+                    self._settings.request_timeout_s,
+                ),
+                metrics=self._metrics,
+            )
+            self._streams[key] = stream
+            return stream
+
+    async def _open(
+        self, session_id: str | None, config: SessionConfig
+    ) -> tuple[SessionInfo, bool]:
+        """The session, and whether it was there already."""
+        key = _key(chosen.session_id(session_id))
+        if session_id:
+            with _past(ErrorKind.UNKNOWN_SESSION):
+                return await self._sessions.info(key), True
+        try:
+            return await self._sessions.create(key, self._blank(config)), False
+        except ServiceError as error:
+            # Somebody opened it in between.
+            if error.kind is not ErrorKind.SESSION_EXISTS:
+                raise
+            return await self._sessions.info(key), True
+
+    async def _fold(
+        self,
+        key: SessionKey,
+        requests: Sequence[FrameRequest],
+        deadline: float | None,
+        *,
+        strict: bool = False,
+    ) -> list[FrameAnswer]:
+        """Folds frames into a session."""
+
+        async def observe(record: SceneRecord) -> tuple[Change, list[FrameAnswer]]:
+            after, packed, answers = await self._forecaster.fold(
+                record,
+                requests,
+                key=key,
+                deadline=deadline,
+                pack=self._sessions.durable,
+                strict=strict,
+            )
+            return Change(after, packed), answers
+
+        return await self._sessions.change(key, observe)
+
+    def _blank(self, config: SessionConfig) -> SceneRecord:
+        """A session before its first frame."""
+        resolved = self._choices.session_config(config)
+        facts = self._choices.model(resolved.model)
+        return SceneRecord(
+            config=resolved,
+            model_hash=facts.info.hash,
+            created_at=self._clock(),
+            timeline=Timeline(self._choices.grid(resolved)),
+        )
+
+    def _check_frames(self, frames: tuple[Frame, ...]) -> None:
+        most = self._settings.max_frames_per_request
+        if not frames:
+            raise invalid("frames", "is empty; at least one frame is required")
+        if len(frames) > most:
+            raise invalid("frames", f"has {len(frames)} frames; a request may have at most {most}")
+
+    @contextmanager
+    def _work(self) -> Iterator[None]:
+        """Counts what is done inside as work in hand; refuses it while draining."""
+        if self._draining:
+            error = ServiceError(
+                ErrorKind.DRAINING,
+                "the service is stopping; another replica may answer",
+                retry_after_s=1.0,
+            )
+            self._metrics.refusals.labels(error.kind.value).inc()
+            raise error
+        self._in_hand += 1
+        self._idle.clear()
+        try:
+            yield
+        except ServiceError as error:
+            self._metrics.refusals.labels(error.kind.value).inc()
+            raise
+        finally:
+            self._in_hand -= 1
+            if not self._in_hand:
+                self._idle.set()
+
+    @asynccontextmanager
+    async def _until(self, deadline: float | None) -> AsyncIterator[float]:
+        """The deadline in force; what is inside ends then, with DEADLINE_EXCEEDED."""
+        now = time.monotonic()
+        longest = now + self._settings.request_timeout_s
+        limit = longest if deadline is None else min(deadline, longest)
+        try:
+            async with asyncio.timeout(limit - now) as scope:
+                yield limit
+        except TimeoutError as error:
+            if not scope.expired():
+                raise
+            raise ServiceError(
+                ErrorKind.DEADLINE_EXCEEDED, "the deadline passed before the work was done"
+            ) from error
+
+    def _note_batch(self, report: BatchReport) -> None:
+        self._metrics.batch_jobs.observe(report.entries)
+        for waited_s in report.waited_s:
+            self._metrics.stage_seconds.labels("queue").observe(waited_s)
+
+    async def _keep_house(self) -> None:
+        """Closes sessions that have expired and parks those unused, until cancelled."""
+        while True:
+            await asyncio.sleep(HOUSEKEEPING_S)
+            try:
+                await self._sessions.reap()
+                await self._sessions.park()
+            except Exception:
+                # A full queue or a store that is away: the next round tries again.
+                log.exception("housekeeping failed")
+
+
+@contextmanager
+def _past(kind: ErrorKind) -> Iterator[None]:
+    """Goes on after an error of this kind."""
+    try:
+        yield
+    except ServiceError as error:
+        if error.kind is not kind:
+            raise
+
+
+def _key(session_id: str) -> SessionKey:
+    return SessionKey(TENANT, session_id)
+
+
+def _write_token(last_id: str) -> str:
+    return base64.urlsafe_b64encode(last_id.encode()).decode()
+
+
+def _read_token(token: str) -> str:
+    try:
+        return base64.b64decode(token.encode("ascii"), altchars=b"-_", validate=True).decode()
+    except (binascii.Error, ValueError) as error:
+        raise invalid("page_token", "is not a token that this service gave out") from error

@@ -1,0 +1,418 @@
+"""The model behind the queue: the only module of the service that imports torch.
+
+Jobs of many scenes run together: all steps that are ready as one batch, round by round, then
+all forecasts as another. Everything here runs on the inference thread but loading.
+
+**Missing agents.** An agent that is not in the newest frame is forecast from its last observed
+position, but its offsets hold at the same times as everybody's: the model is run that many
+steps further and the steps before the newest frame are left out (linear between two steps
+where the time away is not a whole number of steps).
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trajectron_model import registry
+from trajectron_model.forecast import ForecastRequest, SceneForecast
+from trajectron_model.state import SceneFrame, SceneState
+from trajectron_model.trajectron import Trajectron
+from trajectron_service.messages import (
+    AgentForecast,
+    ForecastMode,
+    GraphEdge,
+    GraphNode,
+    ModelInfo,
+    SceneGraph,
+)
+from trajectron_service.metrics import Stage
+from trajectron_service.scenes import (
+    ForecastTask,
+    ModelFacts,
+    SceneJob,
+    SceneResult,
+    State,
+    States,
+)
+from trajectron_service.settings import Settings, SettingsError
+from trajectron_service.timebase import Grid, Head, Observation, Step, Timeline, advance, head
+
+# A time away that is this close to whole steps counts as whole (share of a step).
+_WHOLE = 1e-3
+_LENGTH = struct.Struct("<Q")
+
+
+class LoadedModel(Protocol):
+    """What the engine serves: a checkpoint read from its file (``registry.load``)."""
+
+    @property
+    def model(self) -> Trajectron:
+        """The network."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """As clients write it."""
+        ...
+
+    @property
+    def sha256(self) -> str:
+        """Of the weights, hexadecimal."""
+        ...
+
+    @property
+    def provenance(self) -> Mapping[str, object]:
+        """Where the weights come from, as JSON values."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """The part of a forecast task that has one number of steps away."""
+
+    task: ForecastTask
+    state: SceneState
+    agents: tuple[str, ...] | None
+    steps_away: float
+
+    @property
+    def request(self) -> ForecastRequest:
+        """What the model is asked: the horizon, and the steps that are left out again."""
+        task = self.task
+        return ForecastRequest(
+            mode=task.mode.value,
+            num_samples=task.num_samples,
+            horizon=task.horizon + int(np.ceil(self.steps_away)),
+            seed=task.seed,
+            step=task.step,
+            agents=self.agents,
+            include_modes=task.include_modes,
+        )
+
+
+class Engine:
+    """Runs scene jobs on loaded models.
+
+    Args:
+        models: the first is the default.
+        observe: told the seconds of each stage of each batch, on the inference thread.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[LoadedModel],
+        *,
+        observe: Callable[[Stage, float], None] = lambda _stage, _seconds: None,
+    ) -> None:
+        if not models:
+            raise ValueError("an engine needs at least one model")
+        self._networks = {loaded.name: loaded.model.eval() for loaded in models}
+        self._default = models[0].name
+        self._facts = {loaded.name: _facts(loaded, loaded is models[0]) for loaded in models}
+        self._observe = observe
+
+    @property
+    def models(self) -> Mapping[str, ModelFacts]:
+        """The loaded models by name."""
+        return self._facts
+
+    @property
+    def default_model(self) -> str:
+        """The model of requests that name none."""
+        return self._default
+
+    def warm_up(self) -> None:
+        """Runs every model once in every mode."""
+        for name, facts in self._facts.items():
+            kind = facts.info.agent_types[0]
+            timeline = Timeline(Grid.of(facts.info.dt_s, None, 1e3))
+            steps: list[Step] = []
+            for k in range(3):
+                places = np.array([[0.0, 0.1 * k], [1.0, 0.1 * k]])
+                frame = Observation(k * facts.info.dt_s, ("a", "b"), (kind, kind), places)
+                taken = advance(timeline, frame)
+                timeline = taken.timeline
+                steps.extend(taken.steps)
+            tasks = tuple(
+                ForecastTask(head(timeline), mode, 20, facts.info.horizon, 0, 0, None, False)
+                for mode in ForecastMode
+            )
+            self.run([SceneJob(name, (), (), tuple(steps), (), tasks)])
+
+    @torch.inference_mode()
+    def run(self, jobs: Sequence[SceneJob]) -> list[SceneResult]:
+        """Does all jobs together, in the order given; one fault fails all."""
+        tables = [_table(job) for job in jobs]
+        forecasts: list[list[tuple[AgentForecast, ...]]] = [[] for _ in jobs]
+        graphs: dict[int, SceneGraph] = {}
+        of_model: dict[str, list[int]] = defaultdict(list)
+        for index, job in enumerate(jobs):
+            of_model[job.model].append(index)
+        for name, indices in of_model.items():
+            network = self._networks[name]
+            start = time.perf_counter()
+            _step_all(network, [(jobs[i], tables[i]) for i in indices])
+            asked = [(i, task) for i in indices for task in jobs[i].forecasts]
+            shown = [(i, jobs[i].graph) for i in indices]
+            heads = [(i, task.head) for i, task in asked]
+            heads += [(i, seen) for i, seen in shown if seen is not None]
+            states = _at_heads(network, [(tables[i], where) for i, where in heads])
+            stepped = time.perf_counter()
+            self._observe("encode", stepped - start)
+            for (i, _), state in zip(heads[len(asked) :], states[len(asked) :], strict=True):
+                graphs[i] = _graph(network, state)
+            if asked:
+                tasks = [task for _, task in asked]
+                drawn = _forecast_all(network, tasks, states[: len(asked)])
+                for (i, _), agents in zip(asked, drawn, strict=True):
+                    forecasts[i].append(agents)
+                self._observe("sample", time.perf_counter() - stepped)
+        return [
+            _result(job, table, tuple(forecasts[i]), graphs.get(i))
+            for i, (job, table) in enumerate(zip(jobs, tables, strict=True))
+        ]
+
+
+def load(
+    settings: Settings, observe: Callable[[Stage, float], None] = lambda _stage, _seconds: None
+) -> Engine:
+    """The engine with the models of the settings; sets torch's thread count, once.
+
+    Raises:
+        SettingsError: a model cannot be found or read, or two have one name.
+    """
+    torch.set_num_threads(settings.torch_threads)
+    wanted = settings.models or (registry.DEFAULT,)
+    first = settings.default_model or wanted[0]
+    loaded = []
+    for source in (first, *(name for name in wanted if name != first)):
+        try:
+            loaded.append(registry.load(source))
+        except (OSError, ValueError, KeyError) as error:
+            raise SettingsError(f"models: cannot load {source!r}: {error}") from error
+    names = Counter(checkpoint.name for checkpoint in loaded)
+    for name, count in names.items():
+        if count > 1:
+            raise SettingsError(f"models: {count} models are called {name!r}; rename a file")
+    return Engine(loaded, observe=observe)
+
+
+def pack(states: Iterable[SceneState]) -> bytes:
+    """States as bytes: each with its length before it."""
+    chunks = [state.to_bytes() for state in states]
+    return b"".join(part for chunk in chunks for part in (_LENGTH.pack(len(chunk)), chunk))
+
+
+def unpack(data: bytes) -> tuple[SceneState, ...]:
+    """The inverse of ``pack``; raises ValueError for bytes that are damaged."""
+    states = []
+    start = 0
+    while start < len(data):
+        if start + _LENGTH.size > len(data):
+            raise ValueError("packed states end within a length")
+        (size,) = _LENGTH.unpack_from(data, start)
+        start += _LENGTH.size
+        if start + size > len(data):
+            raise ValueError("packed states end within a state")
+        states.append(SceneState.from_bytes(data[start : start + size]))
+        start += size
+    return tuple(states)
+
+
+def _facts(loaded: LoadedModel, is_default: bool) -> ModelFacts:
+    config = loaded.model.config
+    info = ModelInfo(
+        name=loaded.name,
+        hash=loaded.sha256,
+        agent_types=config.node_types,
+        dt_s=config.dt_s,
+        horizon=config.horizon,
+        latent_values=config.latent_values,
+        is_default=is_default,
+        provenance=loaded.provenance,
+    )
+    return ModelFacts(info, {name: config.speed_limit_mps(name) for name in config.node_types})
+
+
+def _live(states: States) -> tuple[SceneState, ...]:
+    if isinstance(states, bytes):
+        return unpack(states)
+    return tuple(cast("SceneState", state) for state in states)
+
+
+def _table(job: SceneJob) -> dict[int, SceneState]:
+    """The job's states by serial number."""
+    return dict(zip(job.serials, _live(job.states), strict=True))
+
+
+def _source(
+    network: Trajectron, table: Mapping[int, SceneState], source: int | None, drop: frozenset[str]
+) -> SceneState:
+    if source is None:
+        return network.initial_state()
+    state = table[source]
+    return state.keep([agent for agent in state.ids if agent not in drop]) if drop else state
+
+
+def _frame(observation: Observation) -> SceneFrame:
+    return SceneFrame(observation.time_s, observation.ids, observation.types, observation.positions)
+
+
+def _step_all(network: Trajectron, work: Sequence[tuple[SceneJob, dict[int, SceneState]]]) -> None:
+    """Makes all steps of all jobs, as many at once as are ready; fills the tables."""
+    position = [0] * len(work)
+    # States that nothing needs any more are let go: a long history would keep hundreds.
+    uses = [Counter(step.source for step in job.steps) for job, _ in work]
+    for (job, _), counts in zip(work, uses, strict=True):
+        counts.update(job.keep)
+        counts.update(task.head.source for task in job.forecasts)
+        counts.update([job.graph.source] if job.graph else [])
+    while True:
+        ready: list[tuple[int, Step]] = []
+        for index, (job, table) in enumerate(work):
+            rest = job.steps[position[index] :]
+            for step in rest:
+                if step.source is not None and step.source not in table:
+                    break
+                ready.append((index, step))
+                position[index] += 1
+        if not ready:
+            return
+        sources = [_source(network, work[i][1], s.source, s.drop) for i, s in ready]
+        states = network.step(sources, [_frame(step.frame) for _, step in ready])
+        for (index, step), state in zip(ready, states, strict=True):
+            table = work[index][1]
+            table[step.result] = state
+            uses[index][step.source] -= 1
+            if step.source is not None and uses[index][step.source] == 0:
+                del table[step.source]
+
+
+def _at_heads(
+    network: Trajectron, heads: Sequence[tuple[Mapping[int, SceneState], Head]]
+) -> list[SceneState]:
+    """The state at each head, after its provisional step where it has one."""
+    states = [_source(network, table, where.source, where.drop) for table, where in heads]
+    provisional = [i for i, (_, where) in enumerate(heads) if where.frame is not None]
+    frames = [_frame(where.frame) for _, where in heads if where.frame is not None]
+    if provisional:
+        stepped = network.step([states[i] for i in provisional], frames)
+        for i, state in zip(provisional, stepped, strict=True):
+            states[i] = state
+    return states
+
+
+def _forecast_all(
+    network: Trajectron, tasks: Sequence[ForecastTask], states: Sequence[SceneState]
+) -> list[tuple[AgentForecast, ...]]:
+    """The forecasts of all tasks, drawn together."""
+    draws = [
+        _draws(task, state, network.config.dt_s) for task, state in zip(tasks, states, strict=True)
+    ]
+    flat = [draw for of_task in draws for draw in of_task]
+    drawn = network.forecast([draw.state for draw in flat], [draw.request for draw in flat])
+    by_draw = dict(zip(map(id, flat), drawn, strict=True))
+    answers = []
+    for of_task in draws:
+        found: dict[str, AgentForecast] = {}
+        for draw in of_task:
+            found |= {one.id: one for one in _agents(by_draw[id(draw)], draw)}
+        order = of_task[0].task.agents or of_task[0].state.ids if of_task else ()
+        answers.append(tuple(found[agent] for agent in order))
+    return answers
+
+
+def _draws(task: ForecastTask, state: SceneState, dt_s: float) -> list[_Draw]:
+    """The task, cut by how many steps its agents have been away; nothing for an empty scene."""
+    away = (task.head.time_s - state.last_seen_s.numpy()) / dt_s  # [N]
+    away = np.where(np.abs(away - np.rint(away)) < _WHOLE, np.rint(away), away)
+    if task.agents is None and not away.any():
+        return [_Draw(task, state, None, 0.0)] if state.ids else []
+    steps_away = dict(zip(state.ids, away.tolist(), strict=True))
+    groups: dict[float, list[str]] = defaultdict(list)
+    for agent in state.ids if task.agents is None else task.agents:
+        groups[steps_away[agent]].append(agent)
+    return [_Draw(task, state, tuple(agents), steps) for steps, agents in groups.items()]
+
+
+def _agents(drawn: SceneForecast, draw: _Draw) -> list[AgentForecast]:
+    """One model forecast, agent by agent, with the steps before the newest frame left out."""
+    horizon, away = draw.task.horizon, draw.steps_away
+
+    def ahead(array: NDArray[np.float32] | None, row: int) -> NDArray[np.float32] | None:
+        return None if array is None else _ahead(array[row], horizon, away)
+
+    modes = drawn.sample_modes
+    return [
+        AgentForecast(
+            id=agent,
+            type=drawn.types[row],
+            x=float(drawn.position[row, 0]),
+            y=float(drawn.position[row, 1]),
+            last_observed_time=float(drawn.last_seen_s[row]),
+            observations=int(drawn.observations[row]),
+            heading_known=bool(drawn.heading_known[row]),
+            mode_probabilities=drawn.mode_probabilities[row],
+            mean=ahead(drawn.mean, row),
+            covariance=ahead(drawn.covariance, row),
+            samples=ahead(drawn.samples, row),
+            sample_modes=None if modes is None else modes[row],
+        )
+        for row, agent in enumerate(drawn.ids)
+    ]
+
+
+def _ahead(array: NDArray[np.float32], horizon: int, away: float) -> NDArray[np.float32]:
+    """``array`` [..., H', C] from ``away`` steps on: [..., H, C]."""
+    if away == 0.0:
+        return array
+    whole = int(away)
+    share = np.float32(away - whole)
+    first = array[..., whole : whole + horizon, :]
+    if share == 0.0:
+        return first
+    second = array[..., whole + 1 : whole + 1 + horizon, :]
+    return ((1 - share) * first + share * second).astype(np.float32)
+
+
+def _graph(network: Trajectron, state: SceneState) -> SceneGraph:
+    types = network.config.node_types
+    rows = zip(
+        state.ids,
+        state.node_type.tolist(),
+        state.position.tolist(),
+        state.observations.tolist(),
+        state.last_seen_s.tolist(),
+        strict=True,
+    )
+    nodes = tuple(GraphNode(i, types[t], x, y, n, s) for i, t, (x, y), n, s in rows)
+    edges = tuple(
+        GraphEdge(e.receiver_id, e.sender_id, e.age_steps, e.gone_steps, e.modulation)
+        for e in state.edges()
+    )
+    return SceneGraph(nodes, edges)
+
+
+def _result(
+    job: SceneJob,
+    table: Mapping[int, SceneState],
+    forecasts: tuple[tuple[AgentForecast, ...], ...],
+    graph: SceneGraph | None,
+) -> SceneResult:
+    kept = [table[serial] for serial in job.keep]
+    return SceneResult(
+        states=tuple(State(state) for state in kept),
+        packed=pack(kept) if job.pack else None,
+        forecasts=forecasts,
+        graph=graph,
+        edge_count=len(kept[-1].graph.receiver) if kept else 0,
+    )

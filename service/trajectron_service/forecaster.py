@@ -1,0 +1,310 @@
+"""Frames in, outcomes and forecasts out, for one scene at one version.
+
+The one path of every use case: ``fold`` (pure) decides what the frames cause, then one job
+goes through the batcher, and only when it has succeeded is there a next record.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+
+from trajectron_service import logs
+from trajectron_service.batching import Batcher, Closed, Expired, QueueFull
+from trajectron_service.choices import Choices, task_points
+from trajectron_service.errors import ErrorKind, FieldViolation, ServiceError
+from trajectron_service.messages import (
+    AgentForecast,
+    Forecast,
+    ForecastOptions,
+    Frame,
+    FrameResult,
+    Outcome,
+    SceneGraph,
+)
+from trajectron_service.metrics import Metrics
+from trajectron_service.records import SceneRecord
+from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
+from trajectron_service.timebase import Head, Step, advance, classify, head
+from trajectron_service.validation import Checked, check
+
+log = logs.get(__name__)
+
+# An agent's encoder step costs about as much as this many sampled positions.
+_STEP_POINTS = 20
+_REFUSED = {
+    Outcome.OUT_OF_ORDER: "is {new:.17g}, before the newest frame's {newest:.17g}; frames go "
+    "forward in time",
+    Outcome.CONFLICT: "is {new:.17g}, the newest frame's, whose content differs; a frame cannot "
+    "be changed",
+}
+
+SceneBatcher = Batcher[SceneJob, SceneResult]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRequest:
+    """A frame to fold, what to forecast after it (None: nothing), its number on a stream."""
+
+    frame: Frame
+    options: ForecastOptions | None = None
+    sequence: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnswer:
+    """What became of one frame; ``forecast`` or ``error`` where one was asked for.
+
+    ``stale`` marks a repeated frame of a stream that newer ones have followed: what was asked
+    of it is not answered any more.
+    """
+
+    result: FrameResult
+    forecast: Forecast | None = None
+    error: ServiceError | None = None
+    stale: bool = False
+
+
+@dataclass(eq=False)
+class _Fold:
+    """What frames cause: the record after them (its states still those before), and the work."""
+
+    record: SceneRecord
+    answers: list[FrameAnswer] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
+    tasks: dict[int, ForecastTask] = field(default_factory=dict)  # by the index of the frame
+
+
+class Forecaster:
+    """Folds frames into records, through the batcher."""
+
+    def __init__(self, choices: Choices, batcher: SceneBatcher, metrics: Metrics) -> None:
+        self._choices = choices
+        self._batcher = batcher
+        self._metrics = metrics
+
+    async def fold(
+        self,
+        record: SceneRecord,
+        requests: Sequence[FrameRequest],
+        *,
+        key: Hashable = None,
+        deadline: float | None,
+        pack: bool = False,
+        strict: bool = False,
+    ) -> tuple[SceneRecord, bytes | None, list[FrameAnswer]]:
+        """The record after the frames, its packed states if asked for, an answer to each frame.
+
+        A refused frame leaves the others, unless ``strict``: then it raises, as does a
+        forecast that cannot be made, and no work is done.
+
+        Raises:
+            ServiceError: the work could not be done; none of the frames counts.
+        """
+        folded = self._fold(record, requests)
+        if strict:
+            _raise_first(folded.answers)
+        result = None
+        if folded.steps or folded.tasks:
+            job = self._job(record, folded, pack)
+            result = await self._submit(job, key, self._cost(folded), deadline)
+        after, packed = _with_states(folded.record, record, result)
+        answers = folded.answers
+        for number, (index, task) in enumerate(folded.tasks.items()):
+            assert result is not None  # there were tasks
+            forecast = self._forecast(record, task, result.forecasts[number])
+            answers[index] = dataclasses.replace(answers[index], forecast=forecast)
+        for answer in answers:
+            self._metrics.frames.labels(answer.result.outcome.value).inc()
+        if after.version != record.version:
+            self._metrics.scene_agents.observe(after.agent_count)
+        return after, packed, answers
+
+    async def forecast(
+        self,
+        record: SceneRecord,
+        options: ForecastOptions,
+        *,
+        key: Hashable = None,
+        deadline: float | None,
+    ) -> tuple[SceneRecord, Forecast]:
+        """The futures from the newest frame; the record comes back with live states."""
+        model = self._choices.model(record.model)
+        task = self._choices.task(options, record.timeline, record.version, model)
+        job = dataclasses.replace(_idle_job(record), forecasts=(task,))
+        result = await self._submit(job, key, task_points(task, model), deadline)
+        after, _ = _with_states(record, record, result)
+        return after, self._forecast(record, task, result.forecasts[0])
+
+    async def graph(
+        self, record: SceneRecord, *, key: Hashable = None, deadline: float | None
+    ) -> tuple[SceneRecord, SceneGraph]:
+        """The graph at the newest frame, empty before the first."""
+        if record.timeline.newest is None:
+            return record, SceneGraph((), ())
+        where: Head = head(record.timeline)
+        job = dataclasses.replace(_idle_job(record), graph=where)
+        result = await self._submit(job, key, len(where.ids), deadline)
+        assert result.graph is not None  # asked for
+        after, _ = _with_states(record, record, result)
+        return after, result.graph
+
+    async def packed(self, record: SceneRecord) -> bytes:
+        """The record's states as bytes."""
+        if isinstance(record.states, bytes):
+            return record.states
+        job = dataclasses.replace(_idle_job(record), pack=True)
+        result = await self._submit(job, None, record.agent_count, None)
+        assert result.packed is not None  # asked for
+        return result.packed
+
+    def _fold(self, record: SceneRecord, requests: Sequence[FrameRequest]) -> _Fold:
+        fold = _Fold(record)
+        for request in requests:
+            self._fold_one(fold, request)
+        return fold
+
+    def _fold_one(self, fold: _Fold, request: FrameRequest) -> None:
+        """Takes one frame: its outcome, its steps, its forecast's task."""
+        record, sequence = fold.record, request.sequence
+        last = record.last_sequence
+        if sequence is not None and last is not None and sequence <= last:
+            result = FrameResult(Outcome.DUPLICATE, record.version)
+            answer = FrameAnswer(result, stale=sequence < last)
+        else:
+            record, answer, steps = self._take(record, request.frame)
+            fold.steps.extend(steps)
+            if sequence is not None:
+                record = dataclasses.replace(record, last_sequence=sequence)
+        wanted = request.options is not None and not answer.stale and not answer.result.refused
+        if wanted and request.options is not None:
+            model = self._choices.model(record.model)
+            try:
+                fold.tasks[len(fold.answers)] = self._choices.task(
+                    request.options, record.timeline, record.version, model
+                )
+            except ServiceError as error:
+                answer = dataclasses.replace(answer, error=error)
+        fold.answers.append(answer)
+        fold.record = record
+
+    def _take(
+        self, record: SceneRecord, frame: Frame
+    ) -> tuple[SceneRecord, FrameAnswer, tuple[Step, ...]]:
+        timeline, version = record.timeline, record.version
+        rules = self._choices.type_rules(record.config)
+        checked = check(frame, timeline, rules, self._choices.frame_limits)
+        if isinstance(checked, FieldViolation):
+            return record, FrameAnswer(_refused(Outcome.INVALID, version, checked)), ()
+        outcome = classify(timeline, checked.observation)
+        if outcome is Outcome.ACCEPTED:
+            taken = advance(timeline, checked.observation)
+            after = dataclasses.replace(record, timeline=taken.timeline, version=version + 1)
+            result = FrameResult(taken.outcome, version + 1, taken.gaps, checked.ignored)
+            return after, FrameAnswer(result), taken.steps
+        if outcome is Outcome.DUPLICATE:
+            result = FrameResult(outcome, version, ignored_agents=checked.ignored)
+            return record, FrameAnswer(result), ()
+        return record, FrameAnswer(_out_of_turn(outcome, record, checked)), ()
+
+    def _job(self, before: SceneRecord, fold: _Fold, pack: bool) -> SceneJob:
+        return SceneJob(
+            model=before.model,
+            serials=tuple(state.serial for state in before.timeline.committed),
+            states=before.states,
+            steps=tuple(fold.steps),
+            keep=tuple(state.serial for state in fold.record.timeline.committed),
+            forecasts=tuple(fold.tasks.values()),
+            pack=pack,
+        )
+
+    def _cost(self, fold: _Fold) -> float:
+        model = self._choices.model(fold.record.model)
+        drawn = sum(task_points(task, model) for task in fold.tasks.values())
+        return drawn + _STEP_POINTS * sum(len(step.frame.ids) for step in fold.steps)
+
+    async def _submit(
+        self, job: SceneJob, key: Hashable, cost: float, deadline: float | None
+    ) -> SceneResult:
+        try:
+            return await self._batcher.submit(job, key=key, cost=cost, deadline=deadline)
+        except QueueFull as error:
+            raise ServiceError(
+                ErrorKind.OVERLOADED,
+                "the service is busy: too much work waits already; try again later",
+                retry_after_s=error.retry_after_s,
+            ) from error
+        except Expired as error:
+            raise ServiceError(ErrorKind.DEADLINE_EXCEEDED, str(error)) from error
+        except Closed as error:
+            raise ServiceError(ErrorKind.DRAINING, "the service is stopping") from error
+        except Exception as error:
+            log.exception("job failed", model=job.model, steps=len(job.steps))
+            raise ServiceError(
+                ErrorKind.INTERNAL, "the model failed on this request; the fault is logged"
+            ) from error
+
+    def _forecast(
+        self, record: SceneRecord, task: ForecastTask, agents: tuple[AgentForecast, ...]
+    ) -> Forecast:
+        facts: ModelFacts = self._choices.model(record.model)
+        return Forecast(
+            model=facts.info.name,
+            model_hash=facts.info.hash,
+            mode=task.mode,
+            seed=task.seed,
+            reference_time=task.head.time_s,
+            time_offsets_s=tuple(facts.info.dt_s * (h + 1) for h in range(task.horizon)),
+            agents=agents,
+        )
+
+
+def _idle_job(record: SceneRecord) -> SceneJob:
+    """A job that makes no steps and gives the record's states back, live."""
+    serials = tuple(state.serial for state in record.timeline.committed)
+    return SceneJob(record.model, serials, record.states, keep=serials)
+
+
+def _with_states(
+    record: SceneRecord, before: SceneRecord, result: SceneResult | None
+) -> tuple[SceneRecord, bytes | None]:
+    """The record with the states that came back; the very same one when nothing changed."""
+    if result is None:
+        return record, None
+    if record is before and not isinstance(before.states, bytes):
+        return record, result.packed
+    after = dataclasses.replace(record, states=result.states, edge_count=result.edge_count)
+    return after, result.packed
+
+
+def _refused(outcome: Outcome, version: int, violation: FieldViolation) -> FrameResult:
+    message = f"{violation.field} {violation.description}"
+    return FrameResult(outcome, version, field=violation.field, message=message)
+
+
+def _raise_first(answers: Sequence[FrameAnswer]) -> None:
+    for place, answer in enumerate(answers):
+        if answer.result.refused:
+            raise refusal(answer.result, f"frames[{place}].")
+        if answer.error is not None:
+            raise answer.error
+
+
+def _out_of_turn(outcome: Outcome, record: SceneRecord, checked: Checked) -> FrameResult:
+    newest = record.timeline.newest
+    assert newest is not None  # what is out of turn has something before it
+    text = _REFUSED[outcome].format(new=checked.observation.time_s, newest=newest.time_s)
+    return _refused(outcome, record.version, FieldViolation("time", text))
+
+
+def refusal(result: FrameResult, place: str) -> ServiceError:
+    """A refused frame as an error; ``place`` is put before the field's path."""
+    kind = {
+        Outcome.CONFLICT: ErrorKind.FRAME_CONFLICT,
+        Outcome.OUT_OF_ORDER: ErrorKind.FRAME_OUT_OF_ORDER,
+        Outcome.INVALID: ErrorKind.INVALID_ARGUMENT,
+    }[result.outcome]
+    description = result.message.removeprefix(f"{result.field} ")
+    violation = FieldViolation(f"{place}{result.field}", description)
+    return ServiceError(kind, f"{place}{result.message}", violations=(violation,))
