@@ -118,7 +118,7 @@ class Application:
     async def start(self) -> None:
         """Warms the models up and begins to close idle sessions; then ``ready`` is true."""
         if self._settings.warm_up:
-            await asyncio.to_thread(self._engine.warm_up)
+            await self._batcher.run_alone(self._engine.warm_up)
         self._housekeeper = asyncio.create_task(self._keep_house(), name="housekeeper")
         self._started = True
 

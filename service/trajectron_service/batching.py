@@ -157,6 +157,10 @@ class Batcher(Generic[JobT, ResultT]):
                 raise Expired("the deadline passed before the work was done") from error
             raise
 
+    async def run_alone(self, call: Callable[[], None]) -> None:
+        """Runs something else on the batcher's thread, between batches."""
+        await asyncio.get_running_loop().run_in_executor(self._thread, call)
+
     async def close(self) -> None:
         """Finishes what waits, then ends the thread; further work is refused."""
         self._closed = True

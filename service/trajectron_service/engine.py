@@ -6,11 +6,13 @@ all forecasts as another. Everything here runs on the inference thread but loadi
 **Missing agents.** An agent that is not in the newest frame is forecast from its last observed
 position, but its offsets hold at the same times as everybody's: the model is run that many
 steps further and the steps before the newest frame are left out (linear between two steps
-where the time away is not a whole number of steps).
+where the time away is not a whole number of steps). Where that would go beyond the model's
+longest horizon, the last step's change is held.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections import Counter, defaultdict
@@ -23,6 +25,7 @@ import torch
 from numpy.typing import NDArray
 
 from trajectron_model import registry
+from trajectron_model.config import MAX_HORIZON, ModelConfig
 from trajectron_model.forecast import ForecastRequest, SceneForecast
 from trajectron_model.state import SceneFrame, SceneState
 from trajectron_model.trajectron import Trajectron
@@ -81,7 +84,7 @@ class _Draw:
 
     task: ForecastTask
     state: SceneState
-    agents: tuple[str, ...] | None
+    agents: tuple[str, ...]
     steps_away: float
 
     @property
@@ -91,7 +94,7 @@ class _Draw:
         return ForecastRequest(
             mode=task.mode.value,
             num_samples=task.num_samples,
-            horizon=task.horizon + int(np.ceil(self.steps_away)),
+            horizon=min(task.horizon + math.ceil(self.steps_away), MAX_HORIZON),
             seed=task.seed,
             step=task.step,
             agents=self.agents,
@@ -315,9 +318,7 @@ def _forecast_all(
     network: Trajectron, tasks: Sequence[ForecastTask], states: Sequence[SceneState]
 ) -> list[tuple[AgentForecast, ...]]:
     """The forecasts of all tasks, drawn together."""
-    draws = [
-        _draws(task, state, network.config.dt_s) for task, state in zip(tasks, states, strict=True)
-    ]
+    draws = [_draws(task, state, network.config) for task, state in zip(tasks, states, strict=True)]
     flat = [draw for of_task in draws for draw in of_task]
     drawn = network.forecast([draw.state for draw in flat], [draw.request for draw in flat])
     by_draw = dict(zip(map(id, flat), drawn, strict=True))
@@ -327,20 +328,27 @@ def _forecast_all(
         for draw in of_task:
             found |= {one.id: one for one in _agents(by_draw[id(draw)], draw)}
         order = of_task[0].task.agents or of_task[0].state.ids if of_task else ()
-        answers.append(tuple(found[agent] for agent in order))
+        answers.append(tuple(found[agent] for agent in order if agent in found))
     return answers
 
 
-def _draws(task: ForecastTask, state: SceneState, dt_s: float) -> list[_Draw]:
-    """The task, cut by how many steps its agents have been away; nothing for an empty scene."""
-    away = (task.head.time_s - state.last_seen_s.numpy()) / dt_s  # [N]
+def _draws(task: ForecastTask, state: SceneState, config: ModelConfig) -> list[_Draw]:
+    """The task, cut by how many steps its agents have been away; nothing for an empty scene.
+
+    Agents that cannot move are left out unless they are asked for.
+    """
+    away = (task.head.time_s - state.last_seen_s.numpy()) / config.dt_s  # [N]
     away = np.where(np.abs(away - np.rint(away)) < _WHOLE, np.rint(away), away)
-    if task.agents is None and not away.any():
-        return [_Draw(task, state, None, 0.0)] if state.ids else []
-    steps_away = dict(zip(state.ids, away.tolist(), strict=True))
     groups: dict[float, list[str]] = defaultdict(list)
-    for agent in state.ids if task.agents is None else task.agents:
-        groups[steps_away[agent]].append(agent)
+    rows = zip(state.ids, state.node_type.tolist(), away.tolist(), strict=True)
+    if task.agents is None:
+        for agent, kind, steps in rows:
+            if not config.types[kind].stationary:
+                groups[steps].append(agent)
+    else:
+        steps_away = {agent: steps for agent, _, steps in rows}
+        for agent in task.agents:
+            groups[steps_away[agent]].append(agent)
     return [_Draw(task, state, tuple(agents), steps) for steps, agents in groups.items()]
 
 
@@ -375,13 +383,18 @@ def _ahead(array: NDArray[np.float32], horizon: int, away: float) -> NDArray[np.
     """``array`` [..., H', C] from ``away`` steps on: [..., H, C]."""
     if away == 0.0:
         return array
-    whole = int(away)
-    share = np.float32(away - whole)
+    whole, share = int(away), np.float32(away % 1.0)
+    missing = whole + int(share > 0.0) + horizon - array.shape[-2]
+    if missing > 0:
+        last = array[..., -1:, :]
+        change = last - array[..., -2:-1, :]
+        beyond = np.arange(1, missing + 1, dtype=np.float32)[:, None]  # [steps, 1]
+        array = np.concatenate([array, last + change * beyond], axis=-2)
     first = array[..., whole : whole + horizon, :]
     if share == 0.0:
         return first
     second = array[..., whole + 1 : whole + 1 + horizon, :]
-    return ((1 - share) * first + share * second).astype(np.float32)
+    return (1 - share) * first + share * second
 
 
 def _graph(network: Trajectron, state: SceneState) -> SceneGraph:

@@ -15,6 +15,7 @@ from prometheus_client import (
     Histogram,
     PlatformCollector,
     ProcessCollector,
+    disable_created_metrics,
     generate_latest,
 )
 
@@ -33,6 +34,7 @@ class Metrics:
     """What operators see. One object per application; safe to use from any thread."""
 
     def __init__(self) -> None:
+        disable_created_metrics()  # when a series began is of no use, and doubles the output
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         PlatformCollector(registry=registry)
@@ -65,7 +67,7 @@ class Metrics:
         )
         self.scene_agents = Histogram(
             "trajectron_scene_agents",
-            "Agents in a scene at each accepted frame, those missing but not timed out included.",
+            "Agents in a session's scene after new frames, those not timed out included.",
             buckets=AGENTS,
             registry=registry,
         )
