@@ -45,7 +45,7 @@ class NodeType:
 
 @dataclass(frozen=True)
 class EdgeRadius:
-    """The distance within which two types influence each other (an undirected edge, paper section 4)."""
+    """The distance within which two types influence each other: an undirected edge."""
 
     first: str
     second: str

@@ -93,7 +93,7 @@ class Decoder(nn.Module):
         return o * torch.tanh(c), c
 
     def mixture(self, h: Tensor, velocity: Tensor) -> BivariateMixture:
-        """The mixture over the next velocity from hidden states [..., size] and velocities [..., 2]."""
+        """The mixture over the next velocity, from hidden states [..., size]."""
         raw = self.head(h)
         logits, raw = raw.split([self.components, 5 * self.components], dim=-1)
         raw = raw.unflatten(-1, (self.components, 5))  # [..., M, 5]
@@ -107,24 +107,21 @@ class Decoder(nn.Module):
         scale = torch.exp(self.log_sigma_min + span * torch.sigmoid(raw[..., 2:4] - 1.0))
         return raw[..., :2], scale, _CORRELATION_BOUND * torch.tanh(raw[..., 4])
 
-    def log_prob(self, start: Start, future: Tensor, given: Tensor | None = None) -> Tensor:
+    def log_prob(self, start: Start, future: Tensor) -> Tensor:
         """Log density of each step of a future under teacher forcing: [R, H] nats.
 
         Args:
             start: R rollouts.
-            future: [R, H, 2] velocities, unclipped density.
-            given: [R, H, 2] the velocities fed back, when they differ from ``future``
-                (label noise); ``future`` when None.
+            future: [R, H, 2] velocities; the density is the unclipped one.
         """
-        given = future if given is None else given
         h, c, velocity = start.hidden, start.cell, start.velocity
-        hidden, previous = [], []
+        hidden = []
         for t in range(future.shape[1]):
             h, c = self.cell(start, velocity, h, c)
             hidden.append(h)
-            previous.append(velocity)
-            velocity = given[:, t]
-        mixture = self.mixture(torch.stack(hidden, dim=1), torch.stack(previous, dim=1))
+            velocity = future[:, t]
+        previous = torch.cat([start.velocity.unsqueeze(1), future[:, :-1]], dim=1)
+        mixture = self.mixture(torch.stack(hidden, dim=1), previous)
         return mixture.log_prob(future)
 
     def sample(self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
@@ -148,9 +145,7 @@ class Decoder(nn.Module):
         ]
         return torch.cat(parts) if parts else normal
 
-    def _sample_block(
-        self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor
-    ) -> Tensor:
+    def _sample_block(self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
         h, c, velocity = start.hidden, start.cell, start.velocity
         rows = torch.arange(uniform.shape[0], device=uniform.device)
         steps = []

@@ -69,7 +69,7 @@ class HistoryEncoder(nn.Module):
 
 
 class FutureEncoder(nn.Module):
-    """Encodes the true future for the recognition network: a bi-directional LSTM (training only)."""
+    """Encodes the true future for the recognition network: bi-directional, training only."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

@@ -232,4 +232,4 @@ def sum_by_type(each: Tensor, receiver: Tensor, kind: Tensor, nodes: int, kinds:
     """Sums edge rows [E, G] over (receiver, sender's type) into [N, K, G]."""
     total = each.new_zeros(nodes * kinds, each.shape[-1])
     total.index_add_(0, receiver * kinds + kind, each)
-    return total.reshape(nodes, kinds, -1)  # [N, K, G]
+    return total.reshape(nodes, kinds, each.shape[-1])  # [N, K, G]

@@ -57,9 +57,9 @@ class BivariateMixture(NamedTuple):
 
 
 def choose(weights: Tensor, uniform: Tensor) -> Tensor:
-    """The index [...] that inverts the cumulative distribution of weights [..., M] at ``uniform`` [...]."""
+    """The index [...] at which the cumulated weights [..., M] pass ``uniform`` [...]."""
     edges = weights.cumsum(dim=-1)
-    # Weights sum to one but for rounding: measured against their own total, every draw falls inside.
+    # Measured against their own total: weights sum to one but for rounding.
     below = edges <= uniform.unsqueeze(-1) * edges[..., -1:]
     return below.sum(dim=-1).clamp_max(weights.shape[-1] - 1)
 

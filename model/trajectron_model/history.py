@@ -74,9 +74,7 @@ def scan_influence(history: History, edges: Edges, config: ModelConfig) -> Tenso
     age, gone = graph.scan_ages(edges.mask)
     factors = graph.modulation(age, gone, config)  # [T, E]
     column = edges.receiver * kinds + history.node_type[edges.sender]
-    total = np.stack(
-        [np.bincount(column, weights=row, minlength=nodes * kinds) for row in factors]
-    )
+    total = np.stack([np.bincount(column, weights=row, minlength=nodes * kinds) for row in factors])
     clipped = np.minimum(total, 1.0).astype(np.float32)
     return torch.from_numpy(clipped).reshape(-1, nodes, kinds)
 

@@ -47,24 +47,21 @@ class NodeModel(nn.Module):
         return torch.cat([edges, state.node_h], dim=-1)
 
     def likelihood(
-        self, encoding: Tensor, velocity: Tensor, future: Tensor, known: Tensor, given: Tensor
+        self, encoding: Tensor, velocity: Tensor, future: Tensor, known: Tensor
     ) -> Likelihood:
         """The exact conditional likelihood of a future under every latent value.
 
         Args:
             encoding: [B, D].
-            velocity: [B, 2] last velocity, in the node's frame over its speed scale, as are
-                the next two.
-            future: [B, H, 2] true velocities; anything where unknown.
+            velocity: [B, 2] last velocity, in the node's frame over its speed scale, as is
+                the next.
+            future: [B, H, 2] velocities, fed back as they are; anything where unknown.
             known: [B, H] bool, true on a prefix.
-            given: [B, H, 2] velocities fed back (``future``, or with label noise).
         """
         nodes, horizon = known.shape
         start = self.decoder.start_all(encoding, velocity)
         values = start.gates.shape[0] // max(nodes, 1)
-        each = self.decoder.log_prob(
-            start, future.repeat_interleave(values, 0), given.repeat_interleave(values, 0)
-        )  # [B Z, H]
+        each = self.decoder.log_prob(start, future.repeat_interleave(values, 0))  # [B Z, H]
         each = each.reshape(nodes, values, horizon)
         log_prob = torch.where(known.unsqueeze(1), each, 0.0).sum(dim=-1)  # [B, Z]
         future_encoding = self.future(future.transpose(0, 1), known.transpose(0, 1))

@@ -30,9 +30,7 @@ def locate(name_or_path: str | Path) -> Path:
     if path.is_dir() or stem.with_name(stem.name + ".json").exists():
         return path
     bundled = ", ".join(names()) or "none"
-    raise CheckpointError(
-        f"{name_or_path}: neither a bundled model ({bundled}) nor a checkpoint"
-    )
+    raise CheckpointError(f"{name_or_path}: neither a bundled model ({bundled}) nor a checkpoint")
 
 
 def describe(name_or_path: str | Path) -> Description:

@@ -84,9 +84,7 @@ class SceneState(NamedTuple):
         renumber[rows] = np.arange(len(rows))
         receiver, sender = renumber[self.graph.receiver], renumber[self.graph.sender]
         stays = (receiver >= 0) & (sender >= 0)
-        graph = Graph(
-            receiver[stays], sender[stays], self.graph.age[stays], self.graph.gone[stays]
-        )
+        graph = Graph(receiver[stays], sender[stays], self.graph.age[stays], self.graph.gone[stays])
         return SceneState(
             ids=tuple(self.ids[row] for row in rows),
             node_type=self.node_type[index],
@@ -174,9 +172,7 @@ def admit(state: SceneState, frame: SceneFrame, config: ModelConfig) -> SceneSta
     changed = {i for i, t in zip(frame.ids, types, strict=True) if held.get(i, t) != t}
     if changed:
         state = state.keep([i for i in state.ids if i not in changed])
-    new = [
-        (i, t) for i, t in zip(frame.ids, types, strict=True) if i not in held or i in changed
-    ]
+    new = [(i, t) for i, t in zip(frame.ids, types, strict=True) if i not in held or i in changed]
     if not new:
         return state
     device = state.node_type.device

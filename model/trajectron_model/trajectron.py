@@ -69,9 +69,7 @@ class Trajectron(nn.Module):
         return blank_state(self.config, self.device)
 
     @torch.inference_mode()
-    def step(
-        self, states: Sequence[SceneState], frames: Sequence[SceneFrame]
-    ) -> list[SceneState]:
+    def step(self, states: Sequence[SceneState], frames: Sequence[SceneFrame]) -> list[SceneState]:
         """Folds one frame into each scene; scenes never influence each other.
 
         An agent in the state but not in the frame is carried on. Velocity is displacement
@@ -170,7 +168,8 @@ class Trajectron(nn.Module):
         if rows is not None:
             node, around, node_type = node[rows], around[rows], node_type[rows]
         if len(config.types) == 1:
-            return self.node_model(0).history(before, node, around)
+            only: EncoderState = self.node_model(0).history(before, node, around)
+            return only
         after = [torch.zeros_like(column) for column in before]
         for kind, index in rows_by_type(node_type):
             part = self.node_model(kind).history(
@@ -211,9 +210,7 @@ class Trajectron(nn.Module):
             )
         last = influence[-1].to(device)[index]
         motion = Kinematics(*(column[index] for column in motions[-1]))
-        return Encoded(
-            self.encoding(state, last, node_type[index]), motion, node_type[index]
-        )
+        return Encoded(self.encoding(state, last, node_type[index]), motion, node_type[index])
 
     def encoding(self, state: EncoderState, influence: Tensor, node_type: Tensor) -> Tensor:
         """h_enc [N, D] of nodes of any types from their encoder states and influence [N, K]."""

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from trajectron_model.features import to_frame
+from trajectron_model.features import Kinematics, to_frame
 from trajectron_model.forecast import start_velocity
+from trajectron_model.integration import integrate
 from trajectron_model.latent import categorical_kl
-from trajectron_model.node_model import Likelihood
 from trajectron_model.training.examples import Batch
 from trajectron_model.trajectron import Trajectron, rows_by_type
 
@@ -33,6 +33,10 @@ class ObjectiveSettings:
         beta_ramp: share of the training over which beta goes from start to end.
         label_noise_mps: standard deviation of noise on true velocities. Recorded tracks are
             smooth splines: without it the mixture spends itself on exactly equal velocities.
+        rollout_weight: weight, per metre, of the errors of rollouts on the mixture's mean, as
+            forecasts are made: of the mean over all modes, and of each mode by its posterior
+            probability. Teacher forcing alone never sees a rollout.
+        rollout_share: share of a batch's agents whose rollouts are scored.
     """
 
     name: Literal["elbo", "marginal"] = "elbo"
@@ -40,6 +44,8 @@ class ObjectiveSettings:
     beta_end: float = 1.0
     beta_ramp: float = 0.0
     label_noise_mps: float = 0.05
+    rollout_weight: float = 0.0
+    rollout_share: float = 0.3
 
     def beta(self, progress: float) -> float:
         """beta at a share of the training in [0, 1]."""
@@ -55,6 +61,7 @@ class LossTerms(NamedTuple):
     reconstruction: Tensor  # -E_q[log p(y|x,z)]
     kl: Tensor  # KL(q || p)
     prior_entropy: Tensor
+    rollout: Tensor  # metres: rollout errors, see ObjectiveSettings.rollout_weight
     information: Tensor  # entropy of the mean prior less the mean entropy: how much x says of z
 
 
@@ -75,13 +82,9 @@ def loss_terms(
         beta: weight of the divergence at this step.
         random: of the label noise, and of the frames of agents without a heading.
     """
-    parts = [
-        (part, part.steps.shape[0])
-        for part in _likelihoods(model, batch, settings.label_noise_mps, random)
-    ]
-    agents = sum(count for _, count in parts)
-    terms = [_terms(part, settings.name, beta) for part, _ in parts]
-    weights = [count / agents for _, count in parts]
+    targets = _targets(model, batch, settings.label_noise_mps, random)
+    terms = [_terms(model, target, settings, beta, random) for target in targets]
+    weights = [len(target.known) / len(batch.rows) for target in targets]
     total = [
         torch.stack([w * value for w, value in zip(weights, column, strict=True)]).sum()
         for column in zip(*terms, strict=True)
@@ -89,30 +92,20 @@ def loss_terms(
     return LossTerms(*total)
 
 
-def _terms(part: Likelihood, name: str, beta: float) -> LossTerms:
-    log_prob, log_prior, log_q = part.log_prob, part.log_prior, part.log_recognition
-    nll = -torch.logsumexp(log_prior + log_prob, dim=-1)
-    reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)
-    kl = categorical_kl(log_q, log_prior)
-    if name == "marginal":
-        posterior = torch.log_softmax(log_prior + log_prob, dim=-1).detach()
-        objective = nll + categorical_kl(posterior, log_q)
-    else:
-        objective = reconstruction + beta * kl
-    entropy = -(log_prior.exp() * log_prior).sum(dim=-1)
-    mean_prior = log_prior.exp().mean(dim=0)
-    information = -(mean_prior * mean_prior.clamp_min(1e-12).log()).sum() - entropy.mean()
-    # A common scale whatever the horizon: nats a step, all agents weighing the same.
-    loss = objective.mean() / part.steps.float().mean()
-    return LossTerms(
-        loss, *(v.mean().detach() for v in (nll, reconstruction, kl, entropy)), information.detach()
-    )
+class _Targets(NamedTuple):
+    """What the B agents of one type in a batch are trained towards."""
+
+    kind: int
+    encoding: Tensor  # [B, D]
+    velocity: Tensor  # [B, 2] last, in the agent's frame over the speed scale, as is the next
+    future: Tensor  # [B, H, 2] with label noise
+    known: Tensor  # [B, H]
 
 
-def _likelihoods(
+def _targets(
     model: Trajectron, batch: Batch, label_noise_mps: float, random: np.random.Generator
-) -> list[Likelihood]:
-    """One for each type in the batch."""
+) -> list[_Targets]:
+    """The batch encoded, one part for each type in it."""
     device = model.device
     encoded = model.encode(batch.past, batch.rows)
     last = encoded.motion.position.unsqueeze(1)  # [B, 1, 2]
@@ -128,18 +121,75 @@ def _likelihoods(
         axis = torch.where(encoded.motion.heading_known.unsqueeze(-1), axis, any_axis)
     future = to_frame(velocity, axis.unsqueeze(1))
     known = torch.from_numpy(batch.known).to(device)
-    found = []
-    for kind, index in rows_by_type(encoded.node_type):
-        scale = model.config.types[kind].speed_scale_mps
-        motion = type(encoded.motion)(*(column[index] for column in encoded.motion))
-        scaled = future[index] / scale
-        found.append(
-            model.node_model(kind).likelihood(
-                encoded.encoding[index],
-                start_velocity(model, motion, kind),
-                scaled,
-                known[index],
-                scaled,
-            )
+    return [
+        _Targets(
+            kind,
+            encoded.encoding[index],
+            start_velocity(model, Kinematics(*(column[index] for column in encoded.motion)), kind),
+            future[index] / model.config.types[kind].speed_scale_mps,
+            known[index],
         )
-    return found
+        for kind, index in rows_by_type(encoded.node_type)
+    ]
+
+
+def _terms(
+    model: Trajectron,
+    target: _Targets,
+    settings: ObjectiveSettings,
+    beta: float,
+    random: np.random.Generator,
+) -> LossTerms:
+    part = model.node_model(target.kind).likelihood(
+        target.encoding, target.velocity, target.future, target.known
+    )
+    log_prob, log_prior, log_q = part.log_prob, part.log_prior, part.log_recognition
+    nll = -torch.logsumexp(log_prior + log_prob, dim=-1)
+    reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)
+    kl = categorical_kl(log_q, log_prior)
+    posterior = torch.log_softmax(log_prior + log_prob, dim=-1).detach()
+    if settings.name == "marginal":
+        objective = nll + categorical_kl(posterior, log_q)
+    else:
+        objective = reconstruction + beta * kl
+    # A common scale whatever the horizon: nats a step, all agents weighing the same.
+    loss = objective.mean() / part.steps.float().mean()
+    rollout = loss.new_zeros(())
+    if settings.rollout_weight:
+        count = max(1, round(settings.rollout_share * len(target.known)))
+        rows = random.choice(len(target.known), count, replace=False)
+        index = torch.from_numpy(np.sort(rows)).to(loss.device)
+        rollout = _rollout_error(model, target, index, log_prior[index].exp(), posterior[index])
+        loss = loss + settings.rollout_weight * rollout
+    entropy = -(log_prior.exp() * log_prior).sum(dim=-1)
+    mean_prior = log_prior.exp().mean(dim=0)
+    information = -(mean_prior * mean_prior.clamp_min(1e-12).log()).sum() - entropy.mean()
+    return LossTerms(
+        loss,
+        nll.mean().detach(),
+        reconstruction.mean().detach(),
+        kl.mean().detach(),
+        entropy.mean().detach(),
+        rollout.detach(),
+        information.detach(),
+    )
+
+
+def _rollout_error(
+    model: Trajectron, target: _Targets, index: Tensor, prior: Tensor, log_posterior: Tensor
+) -> Tensor:
+    """Mean displacement in metres of the mean over modes and of the posterior's modes, halved."""
+    agent_type, dt_s = model.config.types[target.kind], model.config.dt_s
+    decoder, scale = model.node_model(target.kind).decoder, agent_type.speed_scale_mps
+    start = decoder.start_all(target.encoding[index], target.velocity[index])
+    limit = start.velocity.new_full((len(start.velocity),), agent_type.speed_limit_mps / scale)
+    horizon, known = target.future.shape[1], target.known[index]
+    velocity, _ = decoder.moments(start, horizon, limit)
+    track = integrate(velocity, dt_s).unflatten(0, prior.shape) * scale  # [B, Z, H, 2]
+    truth = integrate(target.future[index], dt_s) * scale  # [B, H, 2]
+    mean = (prior[..., None, None] * track).sum(dim=1)
+    point = torch.linalg.vector_norm(mean - truth, dim=-1)  # [B, H]
+    each = torch.linalg.vector_norm(track - truth.unsqueeze(1), dim=-1)  # [B, Z, H]
+    modes = (log_posterior.exp().unsqueeze(-1) * each).sum(dim=1)
+    error: Tensor = 0.5 * ((point + modes) * known).sum() / known.sum()
+    return error

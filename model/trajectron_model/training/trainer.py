@@ -136,7 +136,7 @@ def _gradient_step(
         random=np.random.default_rng([settings.seed, step, _BATCH_NOISE]),
     )
     optimiser.zero_grad(set_to_none=True)
-    terms.loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    terms.loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip_norm)
     if not torch.isfinite(norm):
         raise FloatingPointError(

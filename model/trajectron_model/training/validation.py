@@ -37,11 +37,7 @@ class ValidationFigures(NamedTuple):
     @property
     def score(self) -> float:
         """What training selects by, lower is better: the best sample and the point forecast."""
-        return (
-            self.min_ade_20
-            + 0.5 * self.min_fde_20
-            + 0.5 * (self.ade_mean + 0.5 * self.fde_mean)
-        )
+        return self.min_ade_20 + 0.5 * self.min_fde_20 + 0.5 * (self.ade_mean + 0.5 * self.fde_mean)
 
 
 class Validation:
@@ -100,7 +96,7 @@ class Validation:
             float(np.mean([float(getattr(t, name)) for t in terms]))
             for name in ("nll", "prior_entropy", "information")
         )
-        return ValidationFigures(nll, *(float(m) for m in means), entropy, information)
+        return ValidationFigures._make([nll, *means.tolist(), entropy, information])
 
     def _losses(self, model: Trajectron, objective: ObjectiveSettings) -> list[LossTerms]:
         with torch.no_grad():
