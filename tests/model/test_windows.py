@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from trajectron_model.data.eth_ucy import EthUcy
 from trajectron_model.data.recording import Recording
@@ -89,6 +91,18 @@ def test_an_absent_agent_has_no_position() -> None:
 
 def test_recordings_shorter_than_a_window_have_none() -> None:
     assert cut({"a": "###", "b": "###"}, min_agents=2) == {}
+
+
+@given(st.lists(st.text("#.", min_size=9, max_size=9), min_size=1, max_size=4))
+def test_windows_are_those_found_by_looking_at_each(lines: list[str]) -> None:
+    presence = {"always": "#########"} | {f"{n}": line for n, line in enumerate(lines)}
+    expected = {
+        first: ids
+        for first in range(6)
+        for ids in [tuple(a for a, line in presence.items() if line[first : first + 4] == "####")]
+        if len(ids) >= 2
+    }
+    assert cut(presence, min_agents=2) == expected
 
 
 def test_batches_hold_all_windows_in_order() -> None:
