@@ -32,7 +32,7 @@ class ExampleSettings:
         input_noise_m: standard deviation of noise on observed positions.
     """
 
-    agents: int = 192
+    agents: int = 128
     agents_per_scene: int = 12
     short_history: float = 0.2
     long_history: float = 0.1

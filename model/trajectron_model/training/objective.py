@@ -16,7 +16,6 @@ from torch import Tensor
 
 from trajectron_model.features import Kinematics, to_frame
 from trajectron_model.forecast import start_velocity
-from trajectron_model.integration import integrate
 from trajectron_model.latent import categorical_kl
 from trajectron_model.training.examples import Batch
 from trajectron_model.trajectron import Trajectron, rows_by_type
@@ -33,19 +32,13 @@ class ObjectiveSettings:
         beta_ramp: share of the training over which beta goes from start to end.
         label_noise_mps: standard deviation of noise on true velocities. Recorded tracks are
             smooth splines: without it the mixture spends itself on exactly equal velocities.
-        rollout_weight: weight, per metre, of the errors of rollouts on the mixture's mean, as
-            forecasts are made: of the mean over all modes, and of each mode by its posterior
-            probability. Teacher forcing alone never sees a rollout.
-        rollout_share: share of a batch's agents whose rollouts are scored.
     """
 
-    name: Literal["elbo", "marginal"] = "elbo"
+    name: Literal["elbo", "marginal"] = "marginal"
     beta_start: float = 1.0
     beta_end: float = 1.0
     beta_ramp: float = 0.0
     label_noise_mps: float = 0.05
-    rollout_weight: float = 0.0
-    rollout_share: float = 0.3
 
     def beta(self, progress: float) -> float:
         """beta at a share of the training in [0, 1]."""
@@ -61,7 +54,6 @@ class LossTerms(NamedTuple):
     reconstruction: Tensor  # -E_q[log p(y|x,z)]
     kl: Tensor  # KL(q || p)
     prior_entropy: Tensor
-    rollout: Tensor  # metres: rollout errors, see ObjectiveSettings.rollout_weight
     information: Tensor  # entropy of the mean prior less the mean entropy: how much x says of z
 
 
@@ -83,7 +75,7 @@ def loss_terms(
         random: of the label noise, and of the frames of agents without a heading.
     """
     targets = _targets(model, batch, settings.label_noise_mps, random)
-    terms = [_terms(model, target, settings, beta, random) for target in targets]
+    terms = [_terms(model, target, settings.name, beta) for target in targets]
     weights = [len(target.known) / len(batch.rows) for target in targets]
     total = [
         torch.stack([w * value for w, value in zip(weights, column, strict=True)]).sum()
@@ -133,13 +125,7 @@ def _targets(
     ]
 
 
-def _terms(
-    model: Trajectron,
-    target: _Targets,
-    settings: ObjectiveSettings,
-    beta: float,
-    random: np.random.Generator,
-) -> LossTerms:
+def _terms(model: Trajectron, target: _Targets, name: str, beta: float) -> LossTerms:
     part = model.node_model(target.kind).likelihood(
         target.encoding, target.velocity, target.future, target.known
     )
@@ -148,19 +134,12 @@ def _terms(
     reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)
     kl = categorical_kl(log_q, log_prior)
     posterior = torch.log_softmax(log_prior + log_prob, dim=-1).detach()
-    if settings.name == "marginal":
+    if name == "marginal":
         objective = nll + categorical_kl(posterior, log_q)
     else:
         objective = reconstruction + beta * kl
     # A common scale whatever the horizon: nats a step, all agents weighing the same.
     loss = objective.mean() / part.steps.float().mean()
-    rollout = loss.new_zeros(())
-    if settings.rollout_weight:
-        count = max(1, round(settings.rollout_share * len(target.known)))
-        rows = random.choice(len(target.known), count, replace=False)
-        index = torch.from_numpy(np.sort(rows)).to(loss.device)
-        rollout = _rollout_error(model, target, index, log_prior[index].exp(), posterior[index])
-        loss = loss + settings.rollout_weight * rollout
     entropy = -(log_prior.exp() * log_prior).sum(dim=-1)
     mean_prior = log_prior.exp().mean(dim=0)
     information = -(mean_prior * mean_prior.clamp_min(1e-12).log()).sum() - entropy.mean()
@@ -170,26 +149,5 @@ def _terms(
         reconstruction.mean().detach(),
         kl.mean().detach(),
         entropy.mean().detach(),
-        rollout.detach(),
         information.detach(),
     )
-
-
-def _rollout_error(
-    model: Trajectron, target: _Targets, index: Tensor, prior: Tensor, log_posterior: Tensor
-) -> Tensor:
-    """Mean displacement in metres of the mean over modes and of the posterior's modes, halved."""
-    agent_type, dt_s = model.config.types[target.kind], model.config.dt_s
-    decoder, scale = model.node_model(target.kind).decoder, agent_type.speed_scale_mps
-    start = decoder.start_all(target.encoding[index], target.velocity[index])
-    limit = start.velocity.new_full((len(start.velocity),), agent_type.speed_limit_mps / scale)
-    horizon, known = target.future.shape[1], target.known[index]
-    velocity, _ = decoder.moments(start, horizon, limit)
-    track = integrate(velocity, dt_s).unflatten(0, prior.shape) * scale  # [B, Z, H, 2]
-    truth = integrate(target.future[index], dt_s) * scale  # [B, H, 2]
-    mean = (prior[..., None, None] * track).sum(dim=1)
-    point = torch.linalg.vector_norm(mean - truth, dim=-1)  # [B, H]
-    each = torch.linalg.vector_norm(track - truth.unsqueeze(1), dim=-1)  # [B, Z, H]
-    modes = (log_posterior.exp().unsqueeze(-1) * each).sum(dim=1)
-    error: Tensor = 0.5 * ((point + modes) * known).sum() / known.sum()
-    return error

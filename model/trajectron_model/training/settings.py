@@ -26,7 +26,7 @@ class TrainSettings:
         threads: of torch; None leaves them as they are.
     """
 
-    steps: int = 2000
+    steps: int = 1600
     learning_rate: float = 2e-3
     warm_up: float = 0.1
     clip_norm: float = 1.0
@@ -60,10 +60,12 @@ class Preset:
 def presets() -> dict[str, Preset]:
     """All presets by name.
 
-    ``default``: the model this project ships. ``paper``: the paper's own inputs (raw
-    positions, velocities and accelerations), radius and objective. ``traffic``:
+    ``default``: the model this project ships, trained on the exact marginal likelihood.
+    ``elbo``: the same model on the beta-weighted ELBO. ``paper``: the paper's own inputs
+    (raw positions, velocities and accelerations) and radius, on the ELBO. ``traffic``:
     pedestrians, vehicles and cyclists on ApolloScape's 0.5 s grid.
     """
+    elbo = ObjectiveSettings(name="elbo", beta_start=0.02, beta_end=1.0, beta_ramp=0.7)
     traffic = ModelConfig(
         types=(
             NodeType("pedestrian"),
@@ -78,6 +80,7 @@ def presets() -> dict[str, Preset]:
     paper = ModelConfig(features="world", radius_m=1.5)
     return {
         "default": Preset(ModelConfig(), TrainSettings()),
-        "paper": Preset(paper, TrainSettings(examples=ExampleSettings(short_history=0.0))),
+        "elbo": Preset(ModelConfig(), TrainSettings(objective=elbo)),
+        "paper": Preset(paper, TrainSettings(objective=elbo)),
         "traffic": Preset(traffic, TrainSettings(examples=ExampleSettings(agents=96))),
     }

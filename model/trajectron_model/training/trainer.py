@@ -143,7 +143,7 @@ def _gradient_step(
             f"the gradient of step {step} is not finite: {json.dumps(settings.to_json())}"
         )
     optimiser.step()
-    return terms
+    return terms._replace(loss=terms.loss.detach())
 
 
 def _standardise(
