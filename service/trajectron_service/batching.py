@@ -180,12 +180,10 @@ class Batcher(Generic[JobT, ResultT]):
     def _take(self) -> list[_Entry[JobT, ResultT]]:
         """Takes the next batch off the queue and drops what need not run."""
         now = self._clock()
-        for key, line in list(self._lines.items()):
+        for line in self._lines.values():
             self._drop_dead(line, now)
-            if not line.entries:
-                del self._lines[key]
         ready = sorted(
-            self._lines.values(),
+            (line for line in self._lines.values() if line.entries),
             key=lambda line: (line.round, line.entries[0].deadline, line.entries[0].arrival),
         )
         batch: list[_Entry[JobT, ResultT]] = []
@@ -198,6 +196,7 @@ class Batcher(Generic[JobT, ResultT]):
             line.round = self._round + 1
             batch.append(line.entries.popleft())
         self._waiting -= len(batch)
+        self._lines = {key: line for key, line in self._lines.items() if line.entries}
         return batch
 
     def _drop_dead(self, line: _Line[JobT, ResultT], now: float) -> None:
