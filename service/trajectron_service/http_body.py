@@ -13,6 +13,10 @@ from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.http_errors import invalid_body
 from trajectron_service.http_schemas import Body
 
+# Most clients look for an answer only after sending all: a body that is too large is read on,
+# and thrown away, up to this many times the limit.
+_PATIENCE = 16
+
 B = TypeVar("B", bound=Body)
 T = TypeVar("T")
 
@@ -21,8 +25,8 @@ async def read_body(request: Request, shape: type[B], limit_bytes: int) -> B:
     """A request's body in its shape; an empty one is an empty object.
 
     Raises:
-        ServiceError: ``TOO_LARGE`` as soon as more than ``limit_bytes`` are announced or have
-            come, ``MALFORMED`` for what is no JSON, ``INVALID_ARGUMENT`` naming the fields.
+        ServiceError: ``TOO_LARGE`` for more than ``limit_bytes``, of which no more are kept;
+            ``MALFORMED`` for what is no JSON; ``INVALID_ARGUMENT`` naming the fields.
     """
     raw = await _read(request, limit_bytes)
     try:
@@ -37,18 +41,29 @@ async def _read(request: Request, limit_bytes: int) -> bytes:
             ErrorKind.MALFORMED, "the body has a Content-Encoding; send it as plain JSON"
         )
     announced = request.headers.get("content-length", "0")
-    if announced.isdecimal() and int(announced) > limit_bytes:
+    size = int(announced) if announced.isdecimal() else 0
+    waits = request.headers.get("expect", "").lower() == "100-continue"
+    if size > limit_bytes * _PATIENCE or (size > limit_bytes and waits):
         raise _too_large(limit_bytes)
-    chunks: list[bytes] = []
-    size = 0
     try:
-        async for chunk in request.stream():
-            size += len(chunk)
-            if size > limit_bytes:
-                raise _too_large(limit_bytes)
-            chunks.append(chunk)
+        return await _collect(request, limit_bytes)
     except ClientDisconnect:
         raise _gone() from None
+
+
+async def _collect(request: Request, limit_bytes: int) -> bytes:
+    chunks: list[bytes] = []
+    size = 0
+    async for chunk in request.stream():
+        size += len(chunk)
+        if size <= limit_bytes:
+            chunks.append(chunk)
+        elif size > limit_bytes * _PATIENCE:
+            break
+        else:
+            chunks.clear()
+    if size > limit_bytes:
+        raise _too_large(limit_bytes)
     return b"".join(chunks)
 
 

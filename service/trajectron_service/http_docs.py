@@ -9,6 +9,7 @@ from __future__ import annotations
 from importlib import resources
 from typing import Any
 
+import orjson
 from fastapi import FastAPI
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
@@ -25,6 +26,7 @@ from trajectron_service.http_schemas import (
     PredictSessionRequest,
 )
 
+_OPENAPI_PATH = "/openapi.json"
 _ASSETS_PATH = "/docs/assets"
 _REF = "#/components/schemas/{model}"
 _BODIES: tuple[type[BaseModel], ...] = (
@@ -82,15 +84,15 @@ def takes(body: type[BaseModel], *, required: bool = True) -> dict[str, Any]:
 
 
 def add_docs(app: FastAPI, version: str) -> None:
-    """Adds ``/openapi.json`` and ``/docs`` to an application that has neither."""
-    described: dict[str, Any] = {}
+    """Adds ``/openapi.json`` and ``/docs``, which fastapi itself must not have been told to."""
+    described: list[bytes] = []
 
-    def openapi() -> dict[str, Any]:
+    async def openapi() -> Response:
         if not described:
-            described.update(_describe(app, version))
-        return described
+            described.append(orjson.dumps(_describe(app, version)))
+        return Response(described[0], media_type="application/json")
 
-    app.openapi = openapi  # type: ignore[method-assign]  # fastapi's documented way
+    app.add_api_route(_OPENAPI_PATH, openapi, include_in_schema=False)
     static = resources.files("fastapi_offline") / "static"
     app.mount(_ASSETS_PATH, StaticFiles(directory=str(static)))
     app.add_api_route("/docs", _page, include_in_schema=False)
@@ -112,7 +114,7 @@ def _describe(app: FastAPI, version: str) -> dict[str, Any]:
 
 async def _page() -> Response:
     page = get_swagger_ui_html(
-        openapi_url="/openapi.json",
+        openapi_url=_OPENAPI_PATH,
         title="Trajectron",
         swagger_js_url=f"{_ASSETS_PATH}/swagger-ui-bundle.js",
         swagger_css_url=f"{_ASSETS_PATH}/swagger-ui.css",

@@ -69,6 +69,9 @@ class Problem(BaseModel):
 def problem_response(error: ServiceError) -> Response:
     """An error of the core as a problem; retryable ones carry ``Retry-After`` (whole seconds)."""
     headers = {}
+    if error.kind is ErrorKind.TOO_LARGE:
+        # What of the body is still on its way will not be read.
+        headers["Connection"] = "close"
     if error.codes.retryable:
         headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_s or 1.0)))
     problem = Problem(
@@ -145,19 +148,19 @@ def _path(loc: tuple[int | str, ...]) -> str:
 
 async def on_service_error(_request: Request, error: Exception) -> Response:
     """Answers errors of the core."""
-    assert isinstance(error, ServiceError)  # noqa: S101  registered for this class
+    assert isinstance(error, ServiceError)
     return problem_response(error)
 
 
 async def on_http_exception(request: Request, error: Exception) -> Response:
     """Answers errors of HTTP itself."""
-    assert isinstance(error, HTTPException)  # noqa: S101  registered for this class
+    assert isinstance(error, HTTPException)
     return http_problem(error, request.url.path)
 
 
 async def on_invalid_parameters(_request: Request, error: Exception) -> Response:
     """Answers refused path and query parameters."""
-    assert isinstance(error, RequestValidationError)  # noqa: S101  registered for this class
+    assert isinstance(error, RequestValidationError)
     return problem_response(invalid_parameters(error))
 
 

@@ -1,0 +1,163 @@
+"""The life of the process: everything is built here, started, and stopped in good order.
+
+Both servers share one event loop. Start: ports are bound, models loaded, servers up, models
+warmed up; only then is the service ready. Stop, on SIGTERM or SIGINT: health turns, new work
+is refused, work in hand finishes within ``drain_grace_s``, then the servers close.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+
+from trajectron_service import engine, logs
+from trajectron_service.application import Application
+from trajectron_service.grpc_server import SERVICE, grpc_server
+from trajectron_service.health import Health
+from trajectron_service.http_routes import http_app
+from trajectron_service.http_server import HttpServer, listen
+from trajectron_service.metrics import Metrics
+from trajectron_service.settings import Settings, SettingsError
+
+DISTRIBUTION = "trajectron-service"
+
+# The work itself has finished by then: time for the last bytes of calls.
+_LAST_BYTES_S = 1.0
+
+log = logs.get(__name__)
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service: what it is made of, and the ports that it got."""
+
+    application: Application
+    health: Health
+    metrics: Metrics
+    http_port: int
+    grpc_port: int
+
+
+def serve(settings: Settings) -> None:
+    """Runs the service until SIGTERM or SIGINT, and stops in good order.
+
+    Raises:
+        SettingsError: a port is taken, or a model cannot be loaded.
+    """
+    logs.configure(settings.log_level, settings.log_format)
+    asyncio.run(_serve(settings))
+
+
+async def _serve(settings: Settings) -> None:
+    with _stop_signals() as stop:
+        async with running(settings) as service:
+            log.info(
+                "ready",
+                host=settings.host,
+                http_port=service.http_port,
+                grpc_port=service.grpc_port,
+                models=[model.name for model in service.application.list_models()],
+            )
+            await stop.wait()
+            log.info("draining", grace_s=settings.drain_grace_s)
+        log.info("stopped")
+
+
+@asynccontextmanager
+async def running(settings: Settings) -> AsyncIterator[Service]:
+    """The service, ready, on its ports; drained and stopped at the end of the block.
+
+    Raises:
+        SettingsError: a port is taken, or a model cannot be loaded.
+    """
+    metrics = Metrics()
+    metrics.build(version())
+    health = Health(SERVICE)
+    await health.starting()
+    async with AsyncExitStack() as stack:
+        with _port("http_port", settings.host, settings.http_port):
+            listener = stack.enter_context(listen(settings.host, settings.http_port))
+        loaded = engine.load(
+            settings, lambda stage, seconds: metrics.stage_seconds.labels(stage).observe(seconds)
+        )
+        application = Application(settings, loaded, metrics)
+        stack.push_async_callback(application.close)
+        calls = grpc_server(application, health, metrics, settings)
+        with _port("grpc_port", settings.host, settings.grpc_port):
+            grpc_port = calls.add_insecure_port(_address(settings.host, settings.grpc_port))
+        pages = HttpServer(
+            http_app(
+                application,
+                health,
+                metrics,
+                max_body_bytes=settings.max_message_bytes,
+                version=version(),
+            ),
+            listener,
+        )
+        await calls.start()
+        stack.push_async_callback(calls.stop, _LAST_BYTES_S)
+        await pages.start()
+        stack.push_async_callback(pages.stop)
+        stack.push_async_callback(_drain, application, health, settings.drain_grace_s)
+        await application.start()
+        await health.ready()
+        yield Service(application, health, metrics, listener.getsockname()[1], grpc_port)
+
+
+async def _drain(application: Application, health: Health, grace_s: float) -> None:
+    """Health turns and new work is refused at once; work in hand has ``grace_s`` to finish."""
+    await health.draining()
+    application.begin_drain()
+    try:
+        async with asyncio.timeout(grace_s):
+            await application.drained()
+    except TimeoutError:
+        log.warning("work in hand is cut off", grace_s=grace_s)
+
+
+@contextmanager
+def _port(setting: str, host: str, port: int) -> Iterator[None]:
+    """Turns a failure to bind into an error that names the setting."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "the port may be in use"
+        raise SettingsError(f"{setting}: cannot listen on {host}:{port}: {reason}") from error
+
+
+@contextmanager
+def _stop_signals() -> Iterator[asyncio.Event]:
+    """An event that the first SIGTERM or SIGINT sets; a second one acts as it always does."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    signals = (signal.SIGTERM, signal.SIGINT)
+
+    def on_signal() -> None:
+        stop.set()
+        for number in signals:
+            loop.remove_signal_handler(number)
+
+    for number in signals:
+        loop.add_signal_handler(number, on_signal)
+    try:
+        yield stop
+    finally:
+        for number in signals:
+            loop.remove_signal_handler(number)
+
+
+def _address(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def version() -> str:
+    """Of the installed distribution; ``unknown`` when run from a bare source tree."""
+    try:
+        return metadata.version(DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return "unknown"
