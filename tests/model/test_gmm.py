@@ -19,7 +19,8 @@ def mixture(batch: int = 5, components: int = 4) -> BivariateMixture:
 
 
 def full(covariance: torch.Tensor) -> torch.Tensor:
-    return covariance[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
+    matrix: torch.Tensor = covariance[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
+    return matrix
 
 
 def test_density_is_that_of_torch_distributions() -> None:

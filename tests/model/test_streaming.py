@@ -41,8 +41,8 @@ def assert_same(one: SceneState, other: SceneState, tolerance: float = 1e-5) -> 
     assert one.ids == other.ids and one.time_s == other.time_s
     for a, b in zip((*one.motion, *one.encoder), (*other.motion, *other.encoder), strict=True):
         torch.testing.assert_close(a, b, atol=tolerance, rtol=tolerance)
-    for a, b in zip(one.graph, other.graph, strict=True):
-        np.testing.assert_array_equal(a, b)
+    for counter, expected in zip(one.graph, other.graph, strict=True):
+        np.testing.assert_array_equal(counter, expected)
     torch.testing.assert_close(one.influence, other.influence)
 
 
@@ -85,8 +85,8 @@ def test_scenes_stepped_in_one_batch_are_as_alone(
     scenes = [crowd(agents=agents, seed=agents, types=MIXED) for agents in (1, 5, 12, 3)]
     scenes[1][3] = scenes[1][3]._replace(ids=(), types=(), positions=np.empty((0, 2)))
     states = [mixed_model.initial_state() for _ in scenes]
-    for frames in zip(*scenes, strict=True):
-        states = mixed_model.step(states, frames)
+    for at_once in zip(*scenes, strict=True):
+        states = mixed_model.step(states, at_once)
     for state, frames in zip(states, scenes, strict=True):
         assert_same(state, fold(mixed_model, frames))
 

@@ -57,7 +57,7 @@ def train(
     *,
     provenance: dict[str, Any],
     observe: Observer = lambda _: None,
-    device: str = "cpu",
+    device: str | None = None,
     resume_from: bool = False,
 ) -> Checkpoint:
     """Trains a model and leaves the best one, by validation, in ``folder``.
@@ -69,7 +69,7 @@ def train(
         folder: gets ``model.safetensors`` and ``model.json``, and what resuming needs.
         provenance: task, data, licence note...; the recordings, settings and figures are added.
         observe: called after every step.
-        device: ``cpu`` or ``cuda``.
+        device: ``cpu`` or ``cuda``; by default CUDA where there is one.
         resume_from: go on with the training that ``folder`` holds.
 
     Returns:
@@ -86,7 +86,7 @@ def train(
     model = Trajectron(config)
     if isinstance(model.features, WorldFeatures):
         _standardise(model.features, training, config)
-    model = model.to(device)
+    model = model.to(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     examples = Examples(training, config, settings.examples, settings.seed)
     judge = Validation(validation, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)

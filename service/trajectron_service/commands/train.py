@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -12,6 +12,8 @@ from trajectron_service.commands.errors import UsageError
 from trajectron_service.commands.options import FramesPerStep, out
 
 if TYPE_CHECKING:
+    from tqdm import tqdm
+
     from trajectron_model.data.recording import Recording
     from trajectron_model.training.settings import Preset
     from trajectron_model.training.trainer import Progress
@@ -91,8 +93,9 @@ def train(
 
     Example: `trajectron train street.csv --out runs/street --steps 500`
     """
-    import torch
+    from tqdm import tqdm
 
+    from trajectron_model.training.log import TensorBoardLog
     from trajectron_model.training.settings import presets
     from trajectron_model.training.trainer import train as run
 
@@ -110,7 +113,16 @@ def train(
         files or [], validation or [], eth_ucy, data, chosen, frames_per_step
     )
     facts: dict[str, Any] = {"task": task, "preset": preset, "licence": _LICENCE}
-    with _Display(folder, settings.steps) as display:
+    with (
+        tqdm(total=settings.steps, unit=" steps", dynamic_ncols=True) as bar,
+        TensorBoardLog(folder / "tensorboard") as log,
+    ):
+        display = _Display(bar)
+
+        def observe(progress: Progress) -> None:
+            log.record(progress)
+            display.show(progress)
+
         try:
             checkpoint = run(
                 chosen.model,
@@ -119,8 +131,8 @@ def train(
                 judged,
                 folder,
                 provenance=facts,
-                observe=display.show,
-                device=device or ("cuda" if torch.cuda.is_available() else "cpu"),
+                observe=observe,
+                device=device,
                 resume_from=resume,
             )
         except ValueError as error:
@@ -168,41 +180,24 @@ def _recordings(
 
 
 class _Display:
-    """A progress bar with the loss terms, and the same for TensorBoard."""
+    """A progress bar with the loss terms, and a line for each validation."""
 
-    def __init__(self, folder: Path, steps: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-        from tqdm import tqdm
-
-        folder.mkdir(parents=True, exist_ok=True)
-        self._writer = SummaryWriter(str(folder / "tensorboard"))
-        self._bar = tqdm(total=steps, unit=" steps", dynamic_ncols=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-        self._writer.close()
+    def __init__(self, bar: tqdm[NoReturn]) -> None:
+        self._bar = bar
 
     def show(self, progress: Progress) -> None:
-        """One step's terms, and a validation's figures where there are some."""
-        terms = {name: float(value) for name, value in progress.terms._asdict().items()}
+        """One step."""
+        terms, figures = progress.terms, progress.figures
         self._bar.update(progress.step - self._bar.n)
         self._bar.set_postfix(
-            {name: f"{terms[name]:.2f}" for name in ("nll", "reconstruction", "kl")}
+            nll=f"{float(terms.nll):.2f}",
+            reconstruction=f"{float(terms.reconstruction):.2f}",
+            kl=f"{float(terms.kl):.2f}",
         )
-        for name, value in terms.items():
-            self._writer.add_scalar(f"training/{name}", value, progress.step)
-        self._writer.add_scalar("training/learning_rate", progress.learning_rate, progress.step)
-        if progress.figures is None:
-            return
-        for name, value in progress.figures._asdict().items():
-            self._writer.add_scalar(f"validation/{name}", value, progress.step)
-        figures = progress.figures
-        self._bar.write(
-            f"step {progress.step}: validation nll {figures.nll:.2f}, best of 20 "
-            f"{figures.min_ade_20:.3f}/{figures.min_fde_20:.3f} m, point "
-            f"{figures.ade_mean:.3f}/{figures.fde_mean:.3f} m"
-            + (" (best so far)" if progress.best_step == progress.step else "")
-        )
+        if figures is not None:
+            self._bar.write(
+                f"step {progress.step}: validation nll {figures.nll:.2f}, best of 20 "
+                f"{figures.min_ade_20:.3f}/{figures.min_fde_20:.3f} m, point "
+                f"{figures.ade_mean:.3f}/{figures.fde_mean:.3f} m"
+                + (" (best so far)" if progress.best_step == progress.step else "")
+            )

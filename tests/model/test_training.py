@@ -1,0 +1,240 @@
+"""Training: it learns, it is reproducible, it resumes, it takes any types, it refuses bad data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from trajectron_model.checkpoint import Checkpoint, CheckpointError
+from trajectron_model.config import ModelConfig, NodeType
+from trajectron_model.data.readers import read_apolloscape
+from trajectron_model.data.recording import Recording
+from trajectron_model.forecast import ForecastRequest
+from trajectron_model.training.examples import Examples, ExampleSettings
+from trajectron_model.training.settings import TrainSettings, presets
+from trajectron_model.training.trainer import Progress, train
+from trajectron_model.trajectron import Trajectron
+
+SMALL = ModelConfig(
+    latent_values=4, mixture_components=3, decoder_size=24, horizon=5, observed_steps=4
+)
+QUICK = TrainSettings(
+    steps=12, validate_every=4, threads=1, examples=ExampleSettings(agents=16, agents_per_scene=4)
+)
+
+
+def recording(
+    name: str = "made", types: tuple[str, ...] = ("pedestrian",), seed: int = 0, dt_s: float = 0.4
+) -> Recording:
+    """Agents on gentle curves, each there for a while; obstacles stand still."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for agent in range(12):
+        kind = types[agent % len(types)]
+        first = int(random.integers(0, 10))
+        heading = random.uniform(0.0, 2.0 * np.pi) + 0.05 * np.arange(14)
+        speed = 0.0 if kind == "obstacle" else random.uniform(0.8, 1.5)
+        step = dt_s * speed * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        track = random.uniform(0.0, 6.0, 2) + step.cumsum(axis=0)
+        rows += [(first + t, agent, *place) for t, place in enumerate(track)]
+    table = np.array(rows)
+    return Recording.from_rows(
+        name=name,
+        dt_s=dt_s,
+        start_time_s=0.0,
+        ids=[str(i) for i in range(12)],
+        types=[types[i % len(types)] for i in range(12)],
+        step=table[:, 0].astype(np.int64),
+        agent=table[:, 1].astype(np.int64),
+        position=table[:, 2:],
+        source_sha256="0" * 64,
+    )
+
+
+def run(folder: Path, settings: TrainSettings = QUICK, **options: object) -> list[Progress]:
+    seen: list[Progress] = []
+    train(
+        SMALL,
+        settings,
+        [recording()],
+        [recording("judge", seed=1)],
+        folder,
+        provenance={"task": "test"},
+        observe=seen.append,
+        **options,  # type: ignore[arg-type]
+    )
+    return seen
+
+
+def test_the_loss_falls(tmp_path: Path) -> None:
+    seen = run(tmp_path, replace(QUICK, steps=60, learning_rate=1e-2, validate_every=60))
+    first, last = (np.mean([float(p.terms.nll) for p in part]) for part in (seen[:10], seen[-10:]))
+    assert last < first - 3.0
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        run(tmp_path / folder)
+    run(tmp_path / "c", replace(QUICK, seed=1))
+    hashes = [Checkpoint.load(tmp_path / f).sha256 for f in "abc"]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path: Path) -> None:
+    run(tmp_path / "whole")
+
+    class Stop(Exception):
+        pass
+
+    def stop_at_six(progress: Progress) -> None:
+        if progress.step == 6:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(
+            SMALL,
+            QUICK,
+            [recording()],
+            [recording("judge", seed=1)],
+            tmp_path / "cut",
+            provenance={"task": "test"},
+            observe=stop_at_six,
+        )
+    rest = run(tmp_path / "cut", resume_from=True)
+    assert rest[0].step == 5, "it goes on after the last validation, at step 4"
+    assert Checkpoint.load(tmp_path / "cut").sha256 == Checkpoint.load(tmp_path / "whole").sha256
+
+
+def test_a_training_of_other_settings_is_not_resumed(tmp_path: Path) -> None:
+    run(tmp_path)
+    with pytest.raises(ValueError, match="begun with other settings"):
+        run(tmp_path, replace(QUICK, learning_rate=0.5), resume_from=True)
+    with pytest.raises(CheckpointError, match="no training to resume"):
+        run(tmp_path / "empty", resume_from=True)
+
+
+def test_the_best_weights_by_validation_are_kept(tmp_path: Path) -> None:
+    seen = run(tmp_path)
+    judged = [p for p in seen if p.figures is not None]
+    assert [p.step for p in judged] == [4, 8, 12]
+    best = min(judged, key=lambda p: p.figures.score)  # type: ignore[union-attr]
+    selected = Checkpoint.load(tmp_path).provenance["selected"]
+    assert selected["step"] == best.step == judged[-1].best_step
+    assert best.figures is not None
+    assert selected["validation_figures"]["min_ade_20"] == pytest.approx(best.figures.min_ade_20)
+
+
+def test_provenance_names_data_settings_and_figures(tmp_path: Path) -> None:
+    run(tmp_path)
+    facts = json.loads((tmp_path / "model.json").read_text())["provenance"]
+    assert facts["task"] == "test"
+    assert facts["training"]["recordings"] == [recording().provenance]
+    assert facts["validation"]["recordings"][0]["name"] == "judge"
+    assert facts["settings"]["seed"] == 0
+
+
+def test_batches_follow_from_their_number() -> None:
+    examples = Examples([recording()], SMALL, QUICK.examples, seed=3)
+    for one, other in ((examples.batch(5), examples.batch(5)),):
+        np.testing.assert_array_equal(one.past.position, other.past.position)
+    assert (
+        examples.batch(5).past.position.shape != examples.batch(6).past.position.shape
+        or (examples.batch(5).past.position != examples.batch(6).past.position).any()
+    )
+
+
+def test_examples_are_true_stretches_of_the_recording() -> None:
+    made = recording()
+    plain = replace(QUICK.examples, mirror=False)
+    batch = Examples([made], SMALL, plain, seed=0).batch(0)
+    steps = np.diff(batch.future, axis=1)
+    step_of = {
+        tuple(np.round(made.position[b] - made.position[a], 9))
+        for a in range(len(made.step))
+        for b in range(len(made.step))
+        if made.agent[a] == made.agent[b] and made.step[b] == made.step[a] + 1
+    }
+    both = batch.known[:, 1:] & batch.known[:, :-1]
+    assert both.any()
+    assert {tuple(np.round(s, 9)) for s in steps[both]} <= step_of
+    assert batch.known[:, 0].all() and batch.past.present[-1, batch.rows].all()
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [
+        (recording(dt_s=0.5), "steps of 0.5 s, the model 0.4 s"),
+        (recording(types=("dog",)), "unknown agent type 'dog'"),
+        (recording(types=("pedestrian",)).between(0, 1), "two consecutive steps"),
+    ],
+)
+def test_data_that_do_not_fit_are_refused(tmp_path: Path, broken: Recording, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        train(SMALL, QUICK, [broken], [recording()], tmp_path, provenance={})
+
+
+def test_the_papers_inputs_train_too(tmp_path: Path) -> None:
+    config = replace(presets()["paper"].model, decoder_size=24, horizon=5, observed_steps=4)
+    settings = replace(presets()["paper"].train, steps=3, validate_every=3, threads=1)
+    settings = replace(settings, examples=replace(settings.examples, agents=16))
+    checkpoint = train(
+        config, settings, [recording()], [recording("judge")], tmp_path, provenance={}
+    )
+    scale = checkpoint.model.state_dict()["features.std"]
+    assert (scale[0, :2] > 0.5).all() and scale[0, :2].max() != 1.0
+
+
+def test_obstacles_are_context_and_never_targets(tmp_path: Path) -> None:
+    config = replace(
+        SMALL, types=(NodeType("pedestrian"), NodeType("obstacle", speed_limit_mps=0.0))
+    )
+    made = recording(types=("pedestrian", "obstacle"))
+    batch = Examples([made], config, QUICK.examples, 0).batch(0)
+    assert (batch.past.node_type[batch.rows] == 0).all() and (batch.past.node_type == 1).any()
+    judge = recording("judge", seed=1)
+    checkpoint = train(config, QUICK, [made], [judge], tmp_path, provenance={})
+    torch.manual_seed(QUICK.seed)
+    before = Trajectron(config).state_dict()
+    after = checkpoint.model.state_dict()
+    key = "nodes.0.history.edges.1.weight_ih"
+    assert not torch.equal(before[key], after[key]), "what obstacles mean to pedestrians is learnt"
+
+
+def test_three_types_train_predict_save_and_load_on_real_traffic(
+    tmp_path: Path, data_folder: Path
+) -> None:
+    files = sorted((data_folder / "apolloscape").glob("*.txt"))[:4]
+    if not files:
+        pytest.skip("no ApolloScape recordings in TRAJECTRON_DATA")
+    recordings = [read_apolloscape(f) for f in files]
+    preset = presets()["traffic"]
+    config = replace(preset.model, decoder_size=32, latent_values=5, mixture_components=4)
+    settings = replace(preset.train, steps=30, validate_every=15, threads=1)
+    settings = replace(settings, examples=replace(settings.examples, agents=48))
+    seen: list[Progress] = []
+    checkpoint = train(
+        config,
+        settings,
+        recordings[:3],
+        recordings[3:],
+        tmp_path,
+        provenance={},
+        observe=seen.append,
+    )
+    early, late = (np.mean([float(p.terms.nll) for p in s]) for s in (seen[:5], seen[-5:]))
+    assert late < early - 3.0
+    model = checkpoint.model
+    assert len(model.node_model(0).history.edges) == 3, "nine directed edge types in all"
+    state = model.initial_state()
+    for step in range(recordings[3].num_steps):
+        (state,) = model.step([state], [recordings[3].frame(step)])
+    found = model.forecast([state], [ForecastRequest(num_samples=10, include_modes=True)])[0]
+    assert set(found.types) == {"pedestrian", "vehicle", "cyclist"}
+    assert found.samples is not None and np.isfinite(found.samples).all()
+    again = Checkpoint.load(tmp_path).model.forecast([state], [ForecastRequest(num_samples=10)])
+    assert again[0].samples is not None and (again[0].samples == found.samples).all()
