@@ -19,7 +19,7 @@ import asyncio
 import dataclasses
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -149,7 +149,9 @@ class Stream:
         self._drain = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
 
-    async def replies(self, frames: AsyncIterator[StreamFrame]) -> AsyncIterator[StreamReply]:
+    async def replies(
+        self, frames: AsyncIterator[StreamFrame]
+    ) -> AsyncGenerator[StreamReply, None]:
         """One reply to each frame, in order. Close the iterator (``aclosing``) to cancel the work.
 
         Raises:
