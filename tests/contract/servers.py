@@ -13,7 +13,7 @@ from trajectron_model.trajectron import Trajectron
 from trajectron_service.settings import Settings
 
 MAX_MESSAGE_BYTES = 4 * 2**20
-MAX_REPLY_BYTES = 9 * 2**19
+MAX_REPLY_BYTES = 6 * 2**20
 MAX_SESSIONS = 64
 
 

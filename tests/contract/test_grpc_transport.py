@@ -12,7 +12,7 @@ from google.rpc import error_details_pb2, status_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from tests.contract.drivers import GrpcDriver, frame_message, grpc_refusal
-from tests.contract.scenes import agent, frame, walking
+from tests.contract.scenes import walking
 from tests.contract.servers import MAX_MESSAGE_BYTES, MAX_REPLY_BYTES
 
 from trajectron_proto.v1 import trajectron_pb2 as pb
@@ -137,26 +137,22 @@ async def test_a_message_over_the_limit_is_refused_and_one_below_is_read(
     await still_answers(channel)
 
 
-def large(agents: int) -> pb.PredictRequest:
-    """A request whose reply has 30 kB for each agent: 25 modes over 60 steps."""
-    crowd = (agent(str(k), 5.0 * (k % 20), 5.0 * (k // 20)) for k in range(agents))
-    options = pb.ForecastOptions(mode="FORECAST_MODE_GMM", horizon=60)
-    return pb.PredictRequest(frames=[frame_message(frame(0.0, *crowd))], options=options)
-
-
-async def test_a_reply_over_the_limit_fails_and_the_server_lives_on(
-    channel: grpc.aio.Channel,
-) -> None:
-    assert MAX_REPLY_BYTES < 170 * 30_000
-    error = await refusal_of(GrpcDriver(channel).stub.Predict(large(170)))
-    assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-    await still_answers(channel)
-
-
-async def test_large_replies_within_the_limit_arrive(channel: grpc.aio.Channel) -> None:
-    answer = await GrpcDriver(channel).stub.Predict(large(145))
-    # More than gRPC's own default limit, and less than ours.
-    assert 4 * 2**20 < answer.ByteSize() < MAX_REPLY_BYTES
+async def test_the_limit_of_replies_is_ours_not_grpcs_default(channel: grpc.aio.Channel) -> None:
+    driver = GrpcDriver(channel)
+    names = [f"heavy-{k}" for k in range(4)]
+    heavy = {"x" * 1_600_000: "pedestrian"}
+    try:
+        for name in names[:3]:
+            await driver.create_session(name, unknown_types="map", type_map=heavy)
+        listed = await driver.stub.ListSessions(pb.ListSessionsRequest())
+        assert 4 * 2**20 < listed.ByteSize() < MAX_REPLY_BYTES
+        await driver.create_session(names[3], unknown_types="map", type_map=heavy)
+        error = await refusal_of(driver.stub.ListSessions(pb.ListSessionsRequest()))
+        assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        await still_answers(channel)
+    finally:
+        for name in names:
+            await driver.delete_session(name)
 
 
 async def test_a_deadline_is_kept(channel: grpc.aio.Channel) -> None:
