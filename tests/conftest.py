@@ -1,11 +1,13 @@
-"""What all tests share: the real recordings, where there are any."""
+"""What all tests share: the real recordings, where there are any, and a running service."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.process import Served, serving
 
 from trajectron_model.data.eth_ucy import EthUcy
 
@@ -25,3 +27,13 @@ def data_folder() -> Path:
 def eth_ucy(data_folder: Path) -> EthUcy:
     """The ETH/UCY benchmark."""
     return EthUcy(data_folder)
+
+
+@pytest.fixture(scope="session")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A service in a process of its own, with a small model of random weights."""
+    from tests.contract.servers import save_small_model
+
+    folder = tmp_path_factory.mktemp("served")
+    with serving(save_small_model(folder / "small"), folder) as service:
+        yield service

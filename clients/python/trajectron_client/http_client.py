@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import time
 from collections.abc import Iterator, Mapping
 from types import TracebackType
@@ -161,9 +162,12 @@ class AsyncHttpClient(AsyncCalls):
 
 
 def _request(operation: Operation[Any]) -> dict[str, Any]:
+    request = {"url": operation.path, "params": operation.params}
     body = operation.body()
-    content = {} if body is None else {"json": body}
-    return {"url": operation.path, "params": operation.params, **content}
+    if body is None:
+        return request
+    # Not httpx's own encoder: it refuses NaN, which is the service's to refuse, by field.
+    return request | {"content": json.dumps(body), "headers": {"content-type": "application/json"}}
 
 
 def _answer(operation: Operation[T], response: httpx.Response) -> T:

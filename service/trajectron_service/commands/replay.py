@@ -67,7 +67,7 @@ def replay(
 
     `trajectron replay crowd.csv --speed 0 --quiet`
 
-    `trajectron replay biwi_eth.txt --start 780 --seconds 20 --mode full --samples 100`
+    `trajectron replay biwi_eth.txt --start 180 --seconds 20 --mode full --samples 100`
     """
     import asyncio
 

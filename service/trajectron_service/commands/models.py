@@ -1,0 +1,113 @@
+"""``trajectron models``: the models at hand, where they come from and how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import typer
+
+from trajectron_service.commands.options import out
+from trajectron_service.messages import ModelInfo
+
+_HASH_LETTERS = 8
+
+
+def models(
+    which: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME|PATH]...", help="These models; all bundled ones by default."),
+    ] = None,
+    *,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print what `GET /v1/models` answers, provenance too.")
+    ] = False,
+) -> None:
+    """List models with their provenance and figures.
+
+    The figures are of the recordings' validation parts, on which a model was selected:
+    `trajectron evaluate` judges on test sets.
+
+    Examples:
+    `trajectron models`
+
+    `trajectron models eth_ucy runs/mine --json`
+    """
+    from trajectron_model import registry
+
+    infos = [_info(name) for name in which or registry.names()]
+    if json:
+        _print_json(infos)
+    else:
+        _print_table(infos)
+
+
+def _info(name_or_path: str) -> ModelInfo:
+    from trajectron_model import registry
+
+    description = registry.describe(name_or_path)
+    config = description.config
+    return ModelInfo(
+        name=description.name,
+        hash=description.sha256,
+        agent_types=config.node_types,
+        dt_s=config.dt_s,
+        horizon=config.horizon,
+        latent_values=config.latent_values,
+        is_default=name_or_path == registry.DEFAULT,
+        provenance=description.provenance,
+    )
+
+
+def _print_json(infos: Sequence[ModelInfo]) -> None:
+    import orjson
+
+    from trajectron_service.http_encode import model_json
+
+    typer.echo(orjson.dumps({"models": [model_json(info) for info in infos]}).decode())
+
+
+def _print_table(infos: Sequence[ModelInfo]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(
+        box=SIMPLE_HEAD,
+        caption="*: the default. ADE/FDE: best of 20 samples on validation parts, metres.",
+        caption_justify="left",
+    )
+    for column in ("model", "steps", "modes", "ADE/FDE", "sha256"):
+        table.add_column(column, no_wrap=True)
+    for column in ("agents", "trained on"):
+        table.add_column(column, min_width=14)
+    for info in infos:
+        table.add_row(
+            f"{info.name}{'*' if info.is_default else ''}",
+            f"{info.horizon} x {info.dt_s:g} s",
+            str(info.latent_values),
+            _figures(info.provenance),
+            info.hash[:_HASH_LETTERS],
+            ", ".join(info.agent_types),
+            ", ".join(_recordings(info.provenance)) or "not said",
+        )
+    out.print(table)
+
+
+def _figures(provenance: Mapping[str, object]) -> str:
+    """Best of 20 on validation data, where the provenance has it."""
+    figures = _mapping(_mapping(provenance.get("selected")).get("validation_figures"))
+    ade, fde = figures.get("min_ade_20"), figures.get("min_fde_20")
+    if not isinstance(ade, float) or not isinstance(fde, float):
+        return "not said"
+    return f"{ade:.3f}/{fde:.3f}"
+
+
+def _recordings(provenance: Mapping[str, object]) -> list[str]:
+    recordings = _mapping(provenance.get("training")).get("recordings")
+    if not isinstance(recordings, list):
+        return []
+    return [str(_mapping(recording).get("name", "?")) for recording in recordings]
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, Mapping) else {}
