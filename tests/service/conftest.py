@@ -10,12 +10,18 @@ import torch
 from tests.service.building import application, random_network
 
 from trajectron_model.trajectron import Trajectron
+from trajectron_service import logs
 from trajectron_service.application import Application
 
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> None:
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _plain_logs() -> None:
+    logs.configure("error", "json")
 
 
 @pytest.fixture(scope="session")
