@@ -15,7 +15,7 @@ class TensorBoardLog:
     """Writes each step's loss terms and each validation's figures as scalars to a folder."""
 
     def __init__(self, folder: Path) -> None:
-        self._writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+        self._writer = SummaryWriter(str(folder))
 
     def __enter__(self) -> Self:
         return self
@@ -26,7 +26,7 @@ class TensorBoardLog:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._writer.close()  # type: ignore[no-untyped-call]
+        self._writer.close()
 
     def record(self, progress: Progress) -> None:
         """One step."""
@@ -38,4 +38,4 @@ class TensorBoardLog:
                 self._scalar(f"validation/{name}", figure, progress.step)
 
     def _scalar(self, name: str, value: float, step: int) -> None:
-        self._writer.add_scalar(name, value, step)  # type: ignore[no-untyped-call]
+        self._writer.add_scalar(name, value, step)
