@@ -32,6 +32,7 @@ class ObjectiveSettings:
         beta_ramp: share of the training over which beta goes from start to end.
         label_noise_mps: standard deviation of noise on true velocities. Recorded tracks are
             smooth splines: without it the mixture spends itself on exactly equal velocities.
+        encoding_dropout: share of h_enc's values that are dropped.
     """
 
     name: Literal["elbo", "marginal"] = "marginal"
@@ -39,6 +40,7 @@ class ObjectiveSettings:
     beta_end: float = 1.0
     beta_ramp: float = 0.0
     label_noise_mps: float = 0.05
+    encoding_dropout: float = 0.0
 
     def beta(self, progress: float) -> float:
         """beta at a share of the training in [0, 1]."""
@@ -74,7 +76,7 @@ def loss_terms(
         beta: weight of the divergence at this step.
         random: of the label noise, and of the frames of agents without a heading.
     """
-    targets = _targets(model, batch, settings.label_noise_mps, random)
+    targets = _targets(model, batch, settings, random)
     terms = [_terms(model, target, settings.name, beta) for target in targets]
     weights = [len(target.known) / len(batch.rows) for target in targets]
     total = [
@@ -95,7 +97,7 @@ class _Targets(NamedTuple):
 
 
 def _targets(
-    model: Trajectron, batch: Batch, label_noise_mps: float, random: np.random.Generator
+    model: Trajectron, batch: Batch, settings: ObjectiveSettings, random: np.random.Generator
 ) -> list[_Targets]:
     """The batch encoded, one part for each type in it."""
     device = model.device
@@ -103,7 +105,7 @@ def _targets(
     last = encoded.motion.position.unsqueeze(1)  # [B, 1, 2]
     track = torch.cat([last, torch.from_numpy(batch.future).to(device)], dim=1)
     velocity = (track.diff(dim=1) / model.config.dt_s).float()  # [B, H, 2] m/s
-    noise = random.normal(0.0, label_noise_mps, velocity.shape).astype(np.float32)
+    noise = random.normal(0.0, settings.label_noise_mps, velocity.shape).astype(np.float32)
     velocity = velocity + torch.from_numpy(noise).to(device)
     # Without a heading no direction is special: each draws a frame of its own.
     angle = random.uniform(0.0, 2.0 * math.pi, len(batch.rows)).astype(np.float32)
@@ -113,10 +115,14 @@ def _targets(
         axis = torch.where(encoded.motion.heading_known.unsqueeze(-1), axis, any_axis)
     future = to_frame(velocity, axis.unsqueeze(1))
     known = torch.from_numpy(batch.known).to(device)
+    encoding = encoded.encoding
+    if settings.encoding_dropout and model.training:
+        kept = random.random(encoding.shape, dtype=np.float32) >= settings.encoding_dropout
+        encoding = encoding * torch.from_numpy(kept).to(device) / (1.0 - settings.encoding_dropout)
     return [
         _Targets(
             kind,
-            encoded.encoding[index],
+            encoding[index],
             start_velocity(model, Kinematics(*(column[index] for column in encoded.motion)), kind),
             future[index] / model.config.types[kind].speed_scale_mps,
             known[index],

@@ -22,7 +22,7 @@ _LOSS_BATCHES = 4
 
 
 class ValidationFigures(NamedTuple):
-    """Means over judged agents; metres, and nats a future for ``nll``."""
+    """Means over judged agents, then over recordings; metres, and nats a future for ``nll``."""
 
     nll: float
     min_ade_20: float
@@ -43,31 +43,41 @@ class ValidationFigures(NamedTuple):
 class Validation:
     """A fixed selection of windows, so that figures can be compared over a training.
 
+    Recordings weigh the same whatever their crowds, as sets do in the benchmark's means.
+
     Args:
         recordings: validation parts.
         model: gives the numbers of steps.
-        max_agents: windows are thinned evenly to about so many judged agents.
+        max_agents: each recording's windows are thinned evenly to about so many judged agents.
+
+    Raises:
+        ValueError: no recording has an agent that can be judged.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], model: Trajectron, max_agents: int = 800
+        self, recordings: Sequence[Recording], model: Trajectron, max_agents: int = 150
     ) -> None:
         config = model.config
         moves = {t.name for t in config.types if not t.stationary}
         found = [
-            window
+            [
+                window
+                for window in sgan_windows(
+                    recording,
+                    observed=config.observed_steps,
+                    horizon=config.horizon,
+                    min_agents=1,
+                )
+                if set(window.types) <= moves
+            ]
             for recording in recordings
-            for window in sgan_windows(
-                recording, observed=config.observed_steps, horizon=config.horizon, min_agents=1
-            )
-            if set(window.types) <= moves
         ]
-        if not found:
+        self.windows = [_thin(windows, max_agents) for windows in found if windows]
+        if not self.windows:
             raise ValueError(
                 "the validation data has no agent that is seen for "
                 f"{config.observed_steps + config.horizon} steps on end"
             )
-        self.windows = _thin(found, max_agents)
         settings = ExampleSettings(short_history=0.0, long_history=0.0, mirror=False)
         self._examples = Examples(recordings, config, settings, _SEED)
 
@@ -75,21 +85,7 @@ class Validation:
         """The figures of a model as it stands."""
         model.eval()
         predictor = TrajectronPredictor(model, "in training")
-        rows = []
-        forecasts = predictor.predict(self.windows, num_samples=_SAMPLES, seed=_SEED)
-        for window, forecast in zip(self.windows, forecasts, strict=True):
-            truth = window.future()
-            rows.append(
-                np.stack(
-                    [
-                        *_best(forecast.samples, truth),
-                        *_errors(forecast.mode_mean, truth),
-                        *_errors(forecast.mean, truth),
-                    ],
-                    axis=-1,
-                )
-            )
-        means = np.concatenate(rows).mean(axis=0)
+        means = np.mean([_errors_of(predictor, windows) for windows in self.windows], axis=0)
         terms = self._losses(model, objective)
         model.train()
         nll, entropy, information = (
@@ -110,6 +106,22 @@ class Validation:
                 )
                 for number in range(_LOSS_BATCHES)
             ]
+
+
+def _errors_of(predictor: TrajectronPredictor, windows: Sequence[Window]) -> np.ndarray:
+    """[6] the displacement errors of ``ValidationFigures``, in order, means over agents."""
+    forecasts = predictor.predict(windows, num_samples=_SAMPLES, seed=_SEED)
+    rows = []
+    for window, forecast in zip(windows, forecasts, strict=True):
+        truth = window.future()
+        errors = (
+            *_best(forecast.samples, truth),
+            *_errors(forecast.mode_mean, truth),
+            *_errors(forecast.mean, truth),
+        )
+        rows.append(np.stack(errors, axis=-1))
+    mean: np.ndarray = np.concatenate(rows).mean(axis=0)
+    return mean
 
 
 def _best(samples: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
