@@ -158,8 +158,8 @@ def test_a_provisional_step_starts_the_forecast_at_the_newest_frame_and_is_not_k
 def away(engine: Engine, last_s: float, horizon: int) -> tuple[AgentForecast, SceneState, float]:
     """The forecast of Ann, who was not in the frames after 0.8 s."""
     both = [observation(t, ann=(t, 0.0), bob=(9.0, t)) for t in (0.0, 0.4, 0.8)]
-    times = [t for t in np.arange(1.2, last_s + 1e-9, 0.4)]
-    frames = both + [observation(float(t), bob=(9.0, float(t))) for t in times]
+    times = np.arange(1.2, last_s + 1e-9, 0.4).tolist()
+    frames = both + [observation(t, bob=(9.0, t)) for t in times]
     if frames[-1].time_s < last_s - 1e-9:
         frames.append(observation(last_s, bob=(9.0, last_s)))
     job, timeline = job_of(frames)

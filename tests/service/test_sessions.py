@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import random
 
 import pytest
 from tests.service.building import DT_S, Clock, observation, turns
@@ -14,7 +15,7 @@ from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import State
 from trajectron_service.sessions import Change, Sessions
-from trajectron_service.stores import SessionKey
+from trajectron_service.stores import SessionKey, StoredSession
 from trajectron_service.stores.memory import MemoryStore
 from trajectron_service.timebase import Grid, Timeline, advance
 
@@ -40,6 +41,40 @@ async def pack(one: SceneRecord) -> bytes:
     if isinstance(one.states, bytes):
         return one.states
     return "|".join(map(str, one.states)).encode()
+
+
+class DistantStore(MemoryStore):
+    """A store like one over a network: others get their turn before and after each call."""
+
+    async def create(self, key: SessionKey, session: StoredSession) -> bool:
+        await turns(2)
+        done = await super().create(key, session)
+        await turns(3)
+        return done
+
+    async def read(self, key: SessionKey) -> StoredSession | None:
+        await turns(1)
+        found = await super().read(key)
+        await turns(3)
+        return found
+
+    async def write(self, key: SessionKey, session: StoredSession, expected_version: int) -> bool:
+        await turns(2)
+        done = await super().write(key, session, expected_version)
+        await turns(2)
+        return done
+
+    async def touch(self, key: SessionKey, expires_at: float) -> bool:
+        await turns(2)
+        done = await super().touch(key, expires_at)
+        await turns(2)
+        return done
+
+    async def delete(self, key: SessionKey, *, expired_by: float | None = None) -> bool:
+        await turns(1)
+        done = await super().delete(key, expired_by=expired_by)
+        await turns(4)
+        return done
 
 
 class House:
@@ -382,3 +417,65 @@ async def test_without_a_durable_store_no_bytes_are_made_frame_by_frame() -> Non
     stored = await house.store.read(KEY)
     assert stored is not None
     assert stored.data is created.data
+
+
+class Mix:
+    """Clients that open, feed, close and let expire sessions of few names, all at once."""
+
+    def __init__(self, seed: int, durable: bool) -> None:
+        self.random = random.Random(seed)
+        self.house = House(DistantStore(durable=durable), max_sessions=3)
+        self.opened = 0
+        self.ended: list[ErrorKind] = []
+
+    async def client(self) -> None:
+        for _ in range(12):
+            key = SessionKey("default", self.random.choice("ab"))
+            use = self.random.choice([self._open, self._feed, self._feed, self._close, self._time])
+            try:
+                await use(key)
+            except ServiceError as error:
+                self.ended.append(error.kind)
+            await turns(self.random.randrange(4))
+
+    async def _open(self, key: SessionKey) -> None:
+        info = await self.house.sessions.create(key, record())
+        assert info.version == 0
+        self.opened += 1
+
+    async def _feed(self, key: SessionKey) -> None:
+        async def work(before: SceneRecord) -> tuple[Change, None]:
+            await turns(self.random.randrange(4))
+            after = following(before)
+            # Whatever state is given is the one that this version made: nobody else's.
+            assert len(before.timeline.seen) == min(before.version, 1)
+            return Change(after), None
+
+        await self.house.sessions.change(key, work)
+
+    async def _close(self, key: SessionKey) -> None:
+        await self.house.sessions.delete(key)
+
+    async def _time(self, _: SessionKey) -> None:
+        self.house.clock.now += self.random.choice([PARK_S, IDLE_S])
+        await self.house.sessions.park()
+        await self.house.sessions.reap()
+
+
+@pytest.mark.parametrize("durable", [False, True])
+@pytest.mark.parametrize("seed", range(12))
+async def test_whatever_races_sessions_are_freed_once_and_nothing_is_left(
+    seed: int, durable: bool
+) -> None:
+    mix = Mix(seed, durable)
+    await asyncio.gather(*(mix.client() for _ in range(6)))
+    house = mix.house
+    left = await house.store.count()
+    assert mix.opened == left + house.closed("idle") + house.closed("deleted")
+    assert house.open() == left
+    house.clock.now += IDLE_S
+    assert await house.sessions.reap() == left
+    assert not house.sessions._live
+    assert house.metrics.registry.get_sample_value("trajectron_agents") == 0.0
+    allowed = {ErrorKind.UNKNOWN_SESSION, ErrorKind.SESSION_EXISTS, ErrorKind.OVERLOADED}
+    assert set(mix.ended) <= allowed
