@@ -8,7 +8,9 @@ import math
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import pytest
 from tests.service.building import (
     DT_S,
@@ -112,7 +114,8 @@ async def test_agents_can_be_chosen_and_their_order_is_kept(app: Application) ->
     some = await predict(app, walk(range(4)), options)
     assert [a.id for a in some.agents] == ["cat", "ann"]
     chosen = {a.id: a for a in everyone.agents}
-    assert all((a.samples == chosen[a.id].samples).all() for a in some.agents)
+    for agent in some.agents:
+        np.testing.assert_array_equal(agent.samples, chosen[agent.id].samples)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ async def test_agents_can_be_chosen_and_their_order_is_kept(app: Application) ->
     ],
 )
 async def test_options_out_of_bounds_name_their_field(
-    app: Application, changes: dict[str, object], field: str
+    app: Application, changes: dict[str, Any], field: str
 ) -> None:
     options = dataclasses.replace(QUICK, **changes)
     await app.create_session("s", config())
@@ -290,7 +293,7 @@ async def test_agents_of_unknown_types_are_told_when_ignored(app: Application) -
     ],
 )
 async def test_a_bad_configuration_names_its_field(
-    app: Application, changes: dict[str, object], field: str
+    app: Application, changes: dict[str, Any], field: str
 ) -> None:
     with pytest.raises(ServiceError) as refusal:
         await app.create_session("s", config(**changes))
@@ -499,13 +502,14 @@ async def test_draining_refuses_new_work_and_finishes_what_is_in_hand(network: T
     engine = Faulty(network)
     app = application(network, engine=engine)
     await app.start()
-    assert app.ready
+    readiness = [app.ready]
     engine.go.clear()
     engine.entered.clear()
     in_hand = asyncio.create_task(predict(app, walk(range(2))))
     await asyncio.to_thread(engine.entered.wait, 5.0)
     app.begin_drain()
-    assert not app.ready
+    readiness.append(app.ready)
+    assert readiness == [True, False]
     with pytest.raises(ServiceError) as refusal:
         await predict(app, walk(range(2)))
     assert kind(refusal) is ErrorKind.DRAINING

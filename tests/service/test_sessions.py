@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import random
+from collections.abc import Awaitable, Callable
 
 import pytest
 from tests.service.building import DT_S, Clock, observation, turns
@@ -156,7 +157,7 @@ async def test_tenants_do_not_see_each_other() -> None:
 @pytest.mark.parametrize("use", ["change", "info", "delete"])
 async def test_what_is_not_open_is_unknown(use: str) -> None:
     house = House()
-    calls = {
+    calls: dict[str, Callable[[], Awaitable[object]]] = {
         "change": house.observe,
         "info": lambda: house.sessions.info(KEY),
         "delete": lambda: house.sessions.delete(KEY),
