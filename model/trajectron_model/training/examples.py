@@ -37,8 +37,8 @@ class ExampleSettings:
     short_history: float = 0.2
     long_history: float = 0.1
     mirror: bool = True
-    scale: float = 0.0
-    input_noise_m: float = 0.0
+    scale: float = 0.3
+    input_noise_m: float = 0.01
 
 
 class Batch(NamedTuple):

@@ -40,7 +40,7 @@ class ObjectiveSettings:
     beta_end: float = 1.0
     beta_ramp: float = 0.0
     label_noise_mps: float = 0.05
-    encoding_dropout: float = 0.0
+    encoding_dropout: float = 0.1
 
     def beta(self, progress: float) -> float:
         """beta at a share of the training in [0, 1]."""
