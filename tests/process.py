@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 START_S = 90.0
-STOP_S = 30.0
+STOP_S = 60.0
 
 
 class Served(NamedTuple):

@@ -6,13 +6,11 @@ packages inside their functions, so that ``trajectron --help`` is quick.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from typing import Annotated
 
 import typer
 
-NAMES = ("serve", "predict", "replay", "simulate", "models", "train", "evaluate")
+from trajectron_service.commands import evaluate, models, predict, replay, serve, simulate, train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -44,7 +42,10 @@ def root(
     """Forecasts where each agent of a scene goes next: a service, and tools around it."""
 
 
-for _name in NAMES:
-    if importlib.util.find_spec(f"{__name__}.{_name}"):
-        _module = importlib.import_module(f"{__name__}.{_name}")
-        app.command(_name)(getattr(_module, _name))
+app.command()(serve.serve)
+app.command()(predict.predict)
+app.command()(replay.replay)
+app.command()(simulate.simulate)
+app.command()(models.models)
+app.command()(train.train)
+app.command()(evaluate.evaluate)

@@ -74,6 +74,8 @@ def evaluate(
 
     Shows ADE/FDE in metres: of the point forecast in both forms, and of the best of 1, 5, 20
     and 100 samples, chosen per agent and jointly per scene; for each set and as their mean.
+
+    Example: `trajectron evaluate --leave-one-out --sets zara1,zara2 --json results.json`
     """
     from trajectron_model.data.eth_ucy import EthUcy
 

@@ -23,7 +23,7 @@ def models(
         bool, typer.Option("--json", help="Print what `GET /v1/models` answers, provenance too.")
     ] = False,
 ) -> None:
-    """List models with their provenance and figures.
+    """Lists models with their provenance and figures.
 
     The figures are of the recordings' validation parts, on which a model was selected:
     `trajectron evaluate` judges on test sets.

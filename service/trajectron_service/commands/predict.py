@@ -66,7 +66,7 @@ def predict(
         typer.Option(metavar="FILE", help="Draw the scene to a file: .png, .svg, .pdf."),
     ] = None,
 ) -> None:
-    """Forecast a recording's agents, without a server: a table, JSON or a picture.
+    """Forecasts a recording's agents, without a server: a table, JSON or a picture.
 
     It goes the way of the service's `/predict`, so the same seed gives the same samples.
 

@@ -58,7 +58,7 @@ def replay(
         bool, typer.Option("--quiet", "-q", help="Only the summary, no line for each frame.")
     ] = False,
 ) -> None:
-    """Stream a recording to a running service; show its forecasts and their latency.
+    """Streams a recording to a running service; shows its forecasts and their latency.
 
     The latency of a frame is the time from sending it to having its forecast.
 

@@ -41,7 +41,7 @@ def serve(
         Literal["console", "json"] | None, typer.Option(help="`console` by default.")
     ] = None,
 ) -> None:
-    """Answer over HTTP and gRPC until SIGTERM or Ctrl-C, then finish the work in hand.
+    """Answers over HTTP and gRPC until SIGTERM or Ctrl-C, then finishes the work in hand.
 
     Every setting can also come from the environment, as `TRAJECTRON_HTTP_PORT`, or from the
     file; flags win over the environment, which wins over the file. The HTTP API is documented

@@ -35,7 +35,7 @@ def simulate(
         typer.Option("--output", "-o", metavar="FILE", help="Standard output by default."),
     ] = None,
 ) -> None:
-    """Write a simulated crowd, walking by social forces (Helbing & Molnár 1995).
+    """Writes a simulated crowd, walking by social forces (Helbing & Molnár 1995).
 
     The area grows with the number of agents, so that the density stays.
 
