@@ -113,6 +113,7 @@ class Application:
             info = facts.info
             metrics.model_info.labels(info.name, info.hash, str(info.is_default).lower()).set(1)
         metrics.queue_length.set_function(lambda: self._batcher.waiting)
+        metrics.in_hand.set_function(lambda: self._in_hand)
         metrics.ready.set_function(lambda: float(self.ready))
 
     async def start(self) -> None:

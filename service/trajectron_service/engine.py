@@ -170,7 +170,8 @@ class Engine:
             heads += [(i, seen) for i, seen in shown if seen is not None]
             states = _at_heads(network, [(tables[i], where) for i, where in heads])
             stepped = time.perf_counter()
-            self._observe("encode", stepped - start)
+            if any(jobs[i].steps for i in indices):
+                self._observe("encode", stepped - start)
             for (i, _), state in zip(heads[len(asked) :], states[len(asked) :], strict=True):
                 graphs[i] = _graph(network, state)
             if asked:

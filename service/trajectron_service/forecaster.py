@@ -6,6 +6,7 @@ goes through the batcher, and only when it has succeeded is there a next record.
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -26,13 +27,15 @@ from trajectron_service.messages import (
 from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
-from trajectron_service.timebase import Head, Step, advance, classify, head
-from trajectron_service.validation import Checked, check
+from trajectron_service.timebase import Step, advance, classify, head
+from trajectron_service.validation import Checked, check, quoted
 
 log = logs.get(__name__)
 
 # An agent's encoder step costs about as much as this many sampled positions.
 _STEP_POINTS = 20
+# Checking this many agents takes some milliseconds; then others have their turn on the loop.
+_AGENTS_PER_TURN = 2000
 _REFUSED = {
     Outcome.OUT_OF_ORDER: "is {new:.17g}, before the newest frame's {newest:.17g}; frames go "
     "forward in time",
@@ -102,7 +105,7 @@ class Forecaster:
         Raises:
             ServiceError: the work could not be done; none of the frames counts.
         """
-        folded = self._fold(record, requests)
+        folded = await self._fold(record, requests)
         if strict:
             _raise_first(folded.answers)
         result = None
@@ -130,7 +133,7 @@ class Forecaster:
         deadline: float | None,
     ) -> tuple[SceneRecord, Forecast]:
         """The futures from the newest frame; the record comes back with live states."""
-        model = self._choices.model(record.model)
+        model = self._model(record)
         task = self._choices.task(options, record.timeline, record.version, model)
         job = dataclasses.replace(_idle_job(record), forecasts=(task,))
         result = await self._submit(job, key, task_points(task, model), deadline)
@@ -143,7 +146,8 @@ class Forecaster:
         """The graph at the newest frame, empty before the first."""
         if record.timeline.newest is None:
             return record, SceneGraph((), ())
-        where: Head = head(record.timeline)
+        self._model(record)
+        where = head(record.timeline)
         job = dataclasses.replace(_idle_job(record), graph=where)
         result = await self._submit(job, key, len(where.ids), deadline)
         assert result.graph is not None  # asked for
@@ -159,13 +163,19 @@ class Forecaster:
         assert result.packed is not None  # asked for
         return result.packed
 
-    def _fold(self, record: SceneRecord, requests: Sequence[FrameRequest]) -> _Fold:
+    async def _fold(self, record: SceneRecord, requests: Sequence[FrameRequest]) -> _Fold:
+        model = self._model(record)
         fold = _Fold(record)
+        agents = 0
         for request in requests:
-            self._fold_one(fold, request)
+            self._fold_one(fold, request, model)
+            agents += len(request.frame.agents)
+            if agents > _AGENTS_PER_TURN:
+                agents = 0
+                await asyncio.sleep(0)
         return fold
 
-    def _fold_one(self, fold: _Fold, request: FrameRequest) -> None:
+    def _fold_one(self, fold: _Fold, request: FrameRequest, model: ModelFacts) -> None:
         """Takes one frame: its outcome, its steps, its forecast's task."""
         record, sequence = fold.record, request.sequence
         last = record.last_sequence
@@ -179,7 +189,6 @@ class Forecaster:
                 record = dataclasses.replace(record, last_sequence=sequence)
         wanted = request.options is not None and not answer.stale and not answer.result.refused
         if wanted and request.options is not None:
-            model = self._choices.model(record.model)
             try:
                 fold.tasks[len(fold.answers)] = self._choices.task(
                     request.options, record.timeline, record.version, model
@@ -207,6 +216,17 @@ class Forecaster:
             result = FrameResult(outcome, version, ignored_agents=checked.ignored)
             return record, FrameAnswer(result), ()
         return record, FrameAnswer(_out_of_turn(outcome, record, checked)), ()
+
+    def _model(self, record: SceneRecord) -> ModelFacts:
+        """The model that made the record's states; raises when it is not loaded any more."""
+        facts = self._choices.model(record.model)
+        if facts.info.hash != record.model_hash:
+            raise ServiceError(
+                ErrorKind.UNKNOWN_MODEL,
+                f"model: this server has other weights under the name {quoted(record.model)} than "
+                "those that this session began with; open a new session",
+            )
+        return facts
 
     def _job(self, before: SceneRecord, fold: _Fold, pack: bool) -> SceneJob:
         return SceneJob(

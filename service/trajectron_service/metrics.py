@@ -109,6 +109,9 @@ class Metrics:
         self.queue_length = Gauge(
             "trajectron_queue_length", "Jobs waiting for the model.", registry=registry
         )
+        self.in_hand = Gauge(
+            "trajectron_work_in_hand", "Calls and streams being worked on.", registry=registry
+        )
         self.ready = Gauge("trajectron_ready", "1 while new work is taken.", registry=registry)
         self.model_info = Gauge(
             "trajectron_model_info",

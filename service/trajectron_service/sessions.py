@@ -28,6 +28,7 @@ from trajectron_service.messages import SessionInfo
 from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.stores import SessionKey, SessionStore, StoredSession
+from trajectron_service.validation import quoted
 
 ResultT = TypeVar("ResultT")
 
@@ -115,7 +116,7 @@ class Sessions:
                 await self._evict(key, "idle", expired_by=now)
                 if not await self._store.create(key, stored):
                     raise ServiceError(
-                        ErrorKind.SESSION_EXISTS, f"session_id: {key.id} is open already"
+                        ErrorKind.SESSION_EXISTS, f"session_id: {quoted(key.id)} is open already"
                     )
             self._replace_live(_Live(key, expires_at, record, record.version))
             await self._count()
@@ -342,5 +343,5 @@ def unknown_session(key: SessionKey) -> ServiceError:
     """The error for a session that does not exist, or not any more."""
     return ServiceError(
         ErrorKind.UNKNOWN_SESSION,
-        f"session_id: {key.id} is unknown; it was never opened, or it was closed or has expired",
+        f"session_id: {quoted(key.id)} is unknown: it was never opened, was closed, or has expired",
     )

@@ -5,7 +5,7 @@ of the model it causes and from which state of the scene a forecast starts; it n
 touches a state itself, it names states by serial number (``Step``, ``Head``).
 
 **Slots.** Time is cut into slots of ``dt / P``: P is ``dt / interval`` where that is a whole
-number (within 1%, at most 20), else 1. Each slot gets one step, from the state that was
+number (within 2%, at most 20), else 1. Each slot gets one step, from the state that was
 committed P slots before: so P chains of states are interleaved, the steps within each are
 ``dt`` apart, and at a declared interval of ``dt / P`` every frame costs one step and every
 forecast starts at the newest frame. The last P + 1 states are kept.
@@ -27,6 +27,9 @@ forecast starts at the newest frame. The last P + 1 states are kept.
 time elapsed; back later, it starts anew and is named as a gap (the last 4096 dropped ids are
 remembered for that). An agent that comes back under another type also starts anew.
 
+A forecast is of the agents that its state has seen: with P > 1 chains, one that flickers may
+be missing from it for less than ``dt``, or stand where its chain last saw it.
+
 Frames must be *world-fixed*: in a frame that moves with the robot a standing person seems
 to walk, and forecasts are wrong.
 """
@@ -47,7 +50,7 @@ from trajectron_service.messages import Outcome
 MAX_CHAINS = 20
 MAX_FILL_STEPS = 4
 DEPARTED_REMEMBERED = 4096
-_INTERVAL_TOLERANCE = 0.01
+_INTERVAL_TOLERANCE = 0.02
 _SLOT_TOLERANCE = 0.2
 _NEAR = 1e-6  # relative: times that differ by less are the same
 

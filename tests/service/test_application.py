@@ -408,6 +408,39 @@ async def test_with_a_durable_store_another_process_goes_on_as_if_nothing_had_ha
     await second.close()
 
 
+async def test_a_session_does_not_go_on_with_other_weights(network: Trajectron) -> None:
+    store, clock = MemoryStore(durable=True), Clock()
+    first = application(network, store=store, clock=clock)
+    await first.create_session("s", config())
+    await observe_all(first, "s", walk(range(2)))
+    other = Engine([Loaded(network, sha256="1" * 64)])
+    second = application(network, store=store, clock=clock, engine=other)
+    for call in (
+        second.observe("s", tuple(walk([2])), None),
+        second.predict_session("s", QUICK, None),
+        second.get_session("s"),
+    ):
+        with pytest.raises(ServiceError) as refusal:
+            await call
+        assert kind(refusal) is ErrorKind.UNKNOWN_MODEL
+    await first.close()
+    await second.close()
+
+
+async def test_a_long_history_leaves_others_their_turn(network: Trajectron) -> None:
+    app = application(network, max_frames_per_request=5000)
+    crowd = [f"a{k}" for k in range(200)]
+    long = asyncio.create_task(predict(app, walk(range(100), crowd)))
+    others = 0
+    while not app._batcher.waiting and not long.done():
+        others += 1
+        await asyncio.sleep(0)
+    # 20,000 agents are checked, at most some 2,000 in one turn of the loop.
+    assert others >= 9
+    long.cancel()
+    await app.close()
+
+
 class Faulty(Engine):
     """An engine that fails, or waits, as told."""
 
