@@ -294,8 +294,6 @@ class Sessions:
                     packed = await self._pack(record)
                     if not await self._write(live, record, packed, live.expires_at):
                         return False
-                if live.users > 1:
-                    return False
                 self._show(live, None)
         finally:
             self._leave(live)

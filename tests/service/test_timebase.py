@@ -113,6 +113,12 @@ def test_frames_faster_than_declared_do_not_hurry_the_model() -> None:
     assert sources == [0, None, 0, 0, 1, 0, 1, 1, 2, 1, 2, 2, 3]
 
 
+def test_of_many_frames_near_a_slot_the_nearest_takes_it() -> None:
+    taken = fold(timeline(), at(np.arange(37) / 30.0))
+    steps = [time for times in step_times(taken) for time in times]
+    assert steps == pytest.approx([0.0, 0.4, 0.8, 1.2])
+
+
 def test_after_a_long_silence_nothing_is_filled() -> None:
     line = timeline(agent_timeout_s=1000.0)
     *_, last = fold(line, [*at([0.0, 0.4]), observation(500.0, ann=(1.0, 0.0))])
