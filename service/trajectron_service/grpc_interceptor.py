@@ -102,7 +102,11 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
             duration_s = time.perf_counter() - start
             self._metrics.request("grpc", method, record.code, duration_s)
             log.info(
-                "call", protocol="grpc", method=method, code=record.code, duration_s=duration_s
+                "call",
+                protocol="grpc",
+                method=method,
+                code=record.code,
+                duration_s=round(duration_s, 6),
             )
 
     def _decoder(self, parse: Any) -> Callable[[bytes], Any]:

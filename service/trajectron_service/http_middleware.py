@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import time
 import uuid
@@ -18,8 +19,13 @@ from trajectron_service.metrics import Metrics
 REQUEST_ID = "X-Request-Id"
 # Probes and scrapes come all the time and say nothing.
 _QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
+# A client may send any word as a verb; not each may become a label.
+_VERBS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 # Ids of clients go into our log: short, and of letters that cannot forge a line.
 _ID = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
+
+_FAULT = ServiceError(ErrorKind.INTERNAL, "a fault of the service; its log has more")
+_STOPPED = ServiceError(ErrorKind.DRAINING, "the service stopped before the work was done")
 
 log = logs.get(__name__)
 
@@ -46,15 +52,19 @@ class RequestMiddleware:
         with bound_contextvars(request_id=sender.request_id):
             try:
                 await self._app(scope, receive, sender)
+            except asyncio.CancelledError:
+                # Requests are cancelled only when a stop has run out of grace.
+                await sender.fail(scope, receive, _STOPPED)
             except Exception:
                 log.exception("fault", protocol="http", path=scope["path"])
-                await sender.fail(scope, receive)
+                await sender.fail(scope, receive, _FAULT)
             finally:
                 self._note(scope, sender.status, time.perf_counter() - start)
 
     def _note(self, scope: Scope, status: int, duration_s: float) -> None:
         template = getattr(scope.get("route"), "path", "unknown")
-        method = f"{scope['method']} {template}"
+        verb = scope["method"] if scope["method"] in _VERBS else "other"
+        method = f"{verb} {template}"
         self._metrics.request("http", method, str(status), duration_s)
         if template not in _QUIET:
             log.info(
@@ -63,7 +73,7 @@ class RequestMiddleware:
                 method=method,
                 path=scope["path"],
                 code=status,
-                duration_s=duration_s,
+                duration_s=round(duration_s, 6),
             )
 
 
@@ -83,12 +93,10 @@ class _Sender:
             MutableHeaders(scope=message)[REQUEST_ID] = self.request_id
         await self._send(message)
 
-    async def fail(self, scope: Scope, receive: Receive) -> None:
-        """Answers 500 unless an answer has begun, which then just breaks off."""
-        if self._started:
-            return
-        error = ServiceError(ErrorKind.INTERNAL, "a fault of the service; its log has more")
-        await problem_response(error)(scope, receive, self)
+    async def fail(self, scope: Scope, receive: Receive, error: ServiceError) -> None:
+        """Answers with an error unless an answer has begun, which then just breaks off."""
+        if not self._started:
+            await problem_response(error)(scope, receive, self)
 
 
 def _request_id(scope: Scope) -> str:

@@ -8,6 +8,8 @@ is refused, work in hand finishes within ``drain_grace_s``, then the servers clo
 from __future__ import annotations
 
 import asyncio
+import logging
+import os
 import signal
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
@@ -31,6 +33,10 @@ _LAST_BYTES_S = 1.0
 log = logs.get(__name__)
 
 
+class LeftBehindError(Exception):
+    """Everything has stopped but the inference thread, which cannot be interrupted."""
+
+
 @dataclass(frozen=True)
 class Service:
     """A running service: what it is made of, and the ports that it got."""
@@ -49,7 +55,13 @@ def serve(settings: Settings) -> None:
         SettingsError: a port is taken, or a model cannot be loaded.
     """
     logs.configure(settings.log_level, settings.log_format)
-    asyncio.run(_serve(settings))
+    try:
+        asyncio.run(_serve(settings))
+    except LeftBehindError as error:
+        log.warning("stopped", reason=str(error))
+        logging.shutdown()
+        # Python itself would wait for the thread, however long it takes.
+        os._exit(0)
 
 
 async def _serve(settings: Settings) -> None:
@@ -73,6 +85,7 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
 
     Raises:
         SettingsError: a port is taken, or a model cannot be loaded.
+        LeftBehindError: at the end, when the model was still at work after the grace.
     """
     metrics = Metrics()
     metrics.build(version())
@@ -85,7 +98,7 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
             settings, lambda stage, seconds: metrics.stage_seconds.labels(stage).observe(seconds)
         )
         application = Application(settings, loaded, metrics)
-        stack.push_async_callback(application.close)
+        stack.push_async_callback(_close, application)
         calls = grpc_server(application, health, metrics, settings)
         with _port("grpc_port", settings.host, settings.grpc_port):
             grpc_port = calls.add_insecure_port(_address(settings.host, settings.grpc_port))
@@ -118,6 +131,14 @@ async def _drain(application: Application, health: Health, grace_s: float) -> No
             await application.drained()
     except TimeoutError:
         log.warning("work in hand is cut off", grace_s=grace_s)
+
+
+async def _close(application: Application) -> None:
+    try:
+        async with asyncio.timeout(_LAST_BYTES_S):
+            await application.close()
+    except TimeoutError:
+        raise LeftBehindError("the model was still at work; nobody waits for it") from None
 
 
 @contextmanager

@@ -18,7 +18,14 @@ import grpc
 import httpx
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from tests.contract.drivers import GrpcDriver, HttpDriver, RefusalError, frame_message, grpc_refusal
+from tests.contract.drivers import (
+    GrpcDriver,
+    HttpDriver,
+    RefusalError,
+    frame_message,
+    grpc_refusal,
+    http_refusal,
+)
 from tests.contract.scenes import walking
 from tests.contract.servers import save_small_model
 from tests.process import environment
@@ -189,7 +196,9 @@ async def test_work_that_outlasts_the_grace_is_cut_off(model: Path) -> None:
         in_hand = asyncio.create_task(http.post("/predict", json=heavy))
         await until(http, "trajectron_work_in_hand 1.0")
         run.process.send_signal(signal.SIGTERM)
-        await asyncio.wait([in_hand])
+        refusal = http_refusal(await in_hand)
+        assert (refusal.kind, refusal.code) == ("DRAINING", "503")
+        # The request alone would take the model far longer than this.
         assert await ended(run) == 0
         assert any("cut off" in line for line in run.log)
 
