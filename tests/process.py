@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-START_S = 90.0
+START_S = 110.0
 STOP_S = 60.0
 
 

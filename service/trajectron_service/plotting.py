@@ -33,7 +33,7 @@ _SAMPLES_IN_ALL = 240  # shared by the agents, each of which has at least
 _FEWEST_SAMPLES = 8  # and at most
 _MOST_SAMPLES = 40
 _FEW_AGENTS = 6  # whose second mode is shown as well
-_ELLIPSE_STEPS = 2
+_MANY_AGENTS = 12  # beyond, ellipses only at the end and not halfway
 _NAMED_AGENTS = 60  # beyond, names would cover the scene
 _MARGIN_M = 0.8
 _LONG_SIDE_IN = 9.0
@@ -73,8 +73,8 @@ def draw(
     axes = figure.add_subplot()
     colours = _colours(forecast.agents)
     for agent in forecast.agents:
-        _draw_samples(axes, agent, colours, detail.samples)
-        _draw_modes(axes, agent, colours, detail.modes)
+        _draw_samples(axes, agent, colours, detail)
+        _draw_modes(axes, agent, colours, detail)
     for agent in forecast.agents:
         away = agent.last_observed_time < forecast.reference_time
         _draw_past(axes, agent, histories.get(agent.id), named=detail.names, away=away)
@@ -98,13 +98,19 @@ class _Detail(NamedTuple):
 
     samples: int
     modes: int
+    ellipses: int
     names: bool
 
     @classmethod
     def of(cls, agents: int) -> _Detail:
         share = _SAMPLES_IN_ALL // max(agents, 1)
         samples = min(max(share, _FEWEST_SAMPLES), _MOST_SAMPLES)
-        return cls(samples, 2 if agents <= _FEW_AGENTS else 1, agents <= _NAMED_AGENTS)
+        return cls(
+            samples,
+            modes=2 if agents <= _FEW_AGENTS else 1,
+            ellipses=2 if agents <= _MANY_AGENTS else 1,
+            names=agents <= _NAMED_AGENTS,
+        )
 
 
 def _position(agent: AgentForecast) -> Positions:
@@ -120,11 +126,13 @@ def _colours(agents: Sequence[AgentForecast]) -> dict[int, str]:
     return dict(zip(best, _COLOURS, strict=False))
 
 
-def _draw_samples(axes: Axes, agent: AgentForecast, colours: Mapping[int, str], count: int) -> None:
+def _draw_samples(
+    axes: Axes, agent: AgentForecast, colours: Mapping[int, str], detail: _Detail
+) -> None:
     """Sampled futures in the colour of the latent value that each came from."""
     if agent.samples is None or agent.sample_modes is None:
         return
-    shown = agent.samples[:count]  # [S, H, 2] offsets
+    shown = agent.samples[: detail.samples]  # [S, H, 2] offsets
     start = np.zeros((len(shown), 1, 2))
     lines = _position(agent) + np.concatenate([start, shown], axis=1)  # [S, 1 + H, 2]
     modes = agent.sample_modes[: len(shown)].tolist()
@@ -144,14 +152,18 @@ def _draw_samples(axes: Axes, agent: AgentForecast, colours: Mapping[int, str], 
         )
 
 
-def _draw_modes(axes: Axes, agent: AgentForecast, colours: Mapping[int, str], count: int) -> None:
+def _draw_modes(
+    axes: Axes, agent: AgentForecast, colours: Mapping[int, str], detail: _Detail
+) -> None:
     """Means of an agent's most probable modes, with ellipses at a few steps."""
     if agent.mean is None or agent.covariance is None:
         return
     likely = agent.mode_probabilities.max()
     horizon = agent.mean.shape[1]
-    steps = np.unique(np.linspace(horizon / _ELLIPSE_STEPS, horizon, _ELLIPSE_STEPS).astype(int))
-    for mode in np.argsort(-agent.mode_probabilities)[:count].tolist():
+    every = horizon / detail.ellipses
+    steps = np.unique(np.linspace(every, horizon, detail.ellipses).round().astype(int))
+    steps = steps[steps > 0]
+    for mode in np.argsort(-agent.mode_probabilities)[: detail.modes].tolist():
         colour = colours.get(mode, _OTHER)
         weight = float(agent.mode_probabilities[mode] / likely)
         path = _position(agent) + np.vstack([np.zeros((1, 2)), agent.mean[mode]])  # [1 + H, 2]

@@ -143,7 +143,7 @@ def test_a_forecast_as_a_table(cli: Cli, model: Path, crowd: Path) -> None:
 def test_an_agent_out_of_sight_is_marked(cli: Cli, model: Path, crowd: Path) -> None:
     text = cli("predict", crowd, "--model", model, "--at", "2.8")
     (bob,) = (line for line in text.splitlines() if line.strip().startswith("bob"))
-    assert "gone 0.8 s" in bob
+    assert "6, 0.8 s ago" in bob
 
 
 def test_json_is_what_the_service_answers(

@@ -132,13 +132,15 @@ def _print_table(forecast: Forecast, name: str) -> None:
     ahead_s = forecast.time_offsets_s[-1]
     table = Table(
         box=SIMPLE_HEAD,
+        pad_edge=False,
         title=f"{name} at {forecast.reference_time:g} s: where in {ahead_s:g} s",
-        caption=f"model {forecast.model}, mode {forecast.mode.value}, seed {forecast.seed}; metres",
+        caption=f"model {forecast.model}, mode {forecast.mode.value}, seed {forecast.seed}. "
+        "Metres; seen: steps.",
         title_justify="left",
         caption_justify="left",
     )
     several_types = len({agent.type for agent in forecast.agents}) > 1
-    for column in ("agent", "steps seen", "at", "mean", *("likely mode",) * _LISTED_MODES):
+    for column in ("agent", "seen", "at", "mean", *("likely mode",) * _LISTED_MODES):
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for agent in forecast.agents:
         name = f"{agent.id} {agent.type}" if several_types else agent.id
@@ -151,12 +153,12 @@ def _cells(agent: AgentForecast, reference_time: float) -> tuple[str, ...]:
 
     assert agent.mean is not None  # asked for whenever a table is printed
     away_s = reference_time - agent.last_observed_time
-    gone = f", gone {away_s:.1f} s" if away_s > 1e-6 else ""
+    ago = f", {away_s:.1f} s ago" if away_s > 1e-6 else ""
     probability = agent.mode_probabilities
     ends = agent.mean[:, -1] + np.array([agent.x, agent.y])  # [Z, 2]
     likely = (-probability).argsort()[:_LISTED_MODES].tolist()
     return (
-        f"{agent.observations}{gone}",
+        f"{agent.observations}{ago}",
         _point(agent.x, agent.y),
         _point(*(probability @ ends).tolist()),
         *(f"{probability[z]:.0%}  {_point(*ends[z].tolist())}" for z in likely),
