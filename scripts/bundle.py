@@ -1,51 +1,51 @@
-"""Bundles trained models: judges each on its test set and puts it among the package's weights.
+"""Bundles trained models: puts them among the package's weights, with their measured errors.
 
-Usage: ``bundle.py --data DIR RUNS``, where ``RUNS/m-SET`` is what ``trajectron train
---eth-ucy SET --out RUNS/m-SET`` left, for ``all`` and for the five test sets. The figures
-go into the provenance beside the hash of the data and windows they were measured on; the
-default model, trained on parts of all recordings, has figures on validation data only.
+Usage: ``bundle.py RUNS [--evaluation FILE]``, where ``RUNS/m-SET`` is what ``trajectron
+train --eth-ucy SET --out RUNS/m-SET`` left, for ``all`` and for the five test sets, and
+FILE what ``trajectron evaluate --leave-one-out --json FILE`` wrote for these very weights.
+The default model, trained on parts of all recordings, has figures on validation data only.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+import json
 from pathlib import Path
 from typing import Any
 
 from trajectron_model import checkpoint, registry
 from trajectron_model.checkpoint import Checkpoint
-from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
-from trajectron_model.data.windows import PROTOCOLS
-from trajectron_model.evaluate import Contender, Entry, EvaluationSet, evaluate
-from trajectron_model.predictor import TrajectronPredictor
+from trajectron_model.data.eth_ucy import TEST_SETS
 
 WEIGHTS = Path(registry.__file__).parent / "weights"
-SAMPLES, SEED = 100, 0
 
 
-def figures(trained: Checkpoint, test_set: str, benchmark: EthUcy) -> dict[str, Any]:
-    """What the provenance says of a leave-one-out model's errors on its test set."""
-    predictor = TrajectronPredictor(trained.model, trained.name)
-    contender = Contender.of_model(predictor, trained.sha256, trained.provenance)
-    result = evaluate(
-        [Entry(trained.name, {test_set: contender})],
-        [EvaluationSet(test_set, tuple(benchmark.test(test_set)))],
-        protocol=PROTOCOLS["sgan"],
-        samples=SAMPLES,
-        seed=SEED,
-    )
-    scores = asdict(result.rows[0].sets[0].scores)
-    return {"fingerprint": asdict(result.fingerprint), "errors_m": scores}
+def errors_of(evaluation: dict[str, Any], test_set: str, sha256: str) -> dict[str, Any]:
+    """What the provenance says of a leave-one-out model's errors on its test set.
+
+    Raises:
+        SystemExit: the evaluation judged no such weights on that set out of sample.
+    """
+    found = [
+        judged
+        for row in evaluation["rows"]
+        for judged in row["sets"]
+        if judged["test_set"] == test_set and judged["model_sha256"] == sha256
+    ]
+    if len(found) != 1 or found[0]["in_sample"]:
+        raise SystemExit(f"the evaluation has no out-of-sample row of {sha256[:8]} on {test_set}")
+    fingerprint = evaluation["fingerprint"]
+    of_set = next(s for s in fingerprint["sets"] if s["test_set"] == test_set)
+    return {"errors_m": found[0]["scores"], "fingerprint": {**fingerprint, "sets": [of_set]}}
 
 
 def main() -> None:
     """Bundles all six."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--evaluation", type=Path)
     arguments = parser.parse_args()
-    benchmark = EthUcy(arguments.data)
+    evaluation = json.loads(arguments.evaluation.read_text()) if arguments.evaluation else None
     WEIGHTS.mkdir(exist_ok=True)
     for test_set in ("all", *TEST_SETS):
         trained = Checkpoint.load(arguments.runs / f"m-{test_set}")
@@ -53,9 +53,10 @@ def main() -> None:
         name = registry.DEFAULT
         if test_set != "all":
             name = f"{registry.DEFAULT}-without-{test_set}"
-            provenance["evaluation"] = figures(trained, test_set, benchmark)
+            if evaluation is not None:
+                provenance["evaluation"] = errors_of(evaluation, test_set, trained.sha256)
         checkpoint.save(WEIGHTS / name, trained.model, provenance)
-        print(name, provenance["selected"], provenance.get("evaluation", {}).get("errors_m", ""))
+        print(name, trained.sha256[:8], provenance["selected"])
 
 
 if __name__ == "__main__":
