@@ -101,6 +101,8 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         stack.push_async_callback(_close, application)
         calls = grpc_server(application, health, metrics, settings)
         with _port("grpc_port", settings.host, settings.grpc_port):
+            # gRPC itself would not say why it cannot bind, but log on its own.
+            listen(settings.host, settings.grpc_port).close()
             grpc_port = calls.add_insecure_port(_address(settings.host, settings.grpc_port))
         pages = HttpServer(
             http_app(
