@@ -48,11 +48,15 @@ SceneBatcher = Batcher[SceneJob, SceneResult]
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
-    """A frame to fold, what to forecast after it (None: nothing), its number on a stream."""
+    """A frame to fold, what to forecast after it (None: nothing), its number on a stream.
+
+    ``fault`` says why what was asked of it means nothing; the answer repeats it.
+    """
 
     frame: Frame
     options: ForecastOptions | None = None
     sequence: int | None = None
+    fault: ServiceError | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +191,8 @@ class Forecaster:
             fold.steps.extend(steps)
             if sequence is not None:
                 record = dataclasses.replace(record, last_sequence=sequence)
+        if request.fault is not None:
+            answer = dataclasses.replace(answer, error=request.fault)
         wanted = request.options is not None and not answer.stale and not answer.result.refused
         if wanted and request.options is not None:
             try:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from trajectron_proto.v1 import trajectron_pb2 as pb
 from trajectron_service import messages as core
-from trajectron_service.errors import invalid
+from trajectron_service.errors import ServiceError, invalid
 
 E = TypeVar("E")
 V = TypeVar("V", bound=int)
@@ -129,13 +129,17 @@ def stream_options(message: pb.StreamOpen) -> core.StreamOptions:
 
 
 def stream_frame(message: pb.StreamFrame) -> core.StreamFrame:
-    """One frame of a stream, with options of its own where it brings some."""
-    own = message.HasField("options")
-    return core.StreamFrame(
-        sequence=message.sequence,
-        frame=frame(message.frame),
-        options=forecast_options(message.options) if own else None,
-    )
+    """One frame of a stream, with options of its own where it brings some.
+
+    Never raises: options that cannot be decoded are a fault of this frame, not of its stream.
+    """
+    options = fault = None
+    if message.HasField("options"):
+        try:
+            options = forecast_options(message.options)
+        except ServiceError as error:
+            fault = error
+    return core.StreamFrame(message.sequence, frame(message.frame), options, fault)
 
 
 def seconds(span: duration_pb2.Duration) -> float:

@@ -210,11 +210,16 @@ class StreamOptions:
 
 @dataclass(frozen=True, slots=True)
 class StreamFrame:
-    """One frame of a stream; ``options`` overrides the stream's for this frame."""
+    """One frame of a stream; ``options`` overrides the stream's for this frame.
+
+    ``fault`` is set instead where it brought options that mean nothing: the frame counts,
+    and its reply says what was wrong.
+    """
 
     sequence: int
     frame: Frame
     options: ForecastOptions | None = None
+    fault: ServiceError | None = None
 
 
 @dataclass(frozen=True, slots=True)

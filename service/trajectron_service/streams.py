@@ -204,9 +204,7 @@ class Stream:
                 if not following.done():
                     break
                 frame = following.result()
-                options = self._options.forecast if frame.options is None else frame.options
-                request = FrameRequest(frame.frame, options, frame.sequence)
-                await self._inbox.put(_Received(request, time.monotonic()))
+                await self._inbox.put(_Received(self._request(frame), time.monotonic()))
         except StopAsyncIteration:
             pass
         except Exception as error:  # noqa: BLE001 - whatever the transport raises ends the stream
@@ -216,6 +214,13 @@ class Stream:
             if following is not None:
                 following.cancel()
         await self._inbox.put(_End(fault))
+
+    def _request(self, frame: StreamFrame) -> FrameRequest:
+        """The frame with what is asked of it: its own options before the stream's."""
+        options = frame.options
+        if options is None and frame.fault is None:
+            options = self._options.forecast
+        return FrameRequest(frame.frame, options, frame.sequence, frame.fault)
 
     async def _work(self) -> None:
         """Answers what is in the inbox, until the reader says that there is no more."""

@@ -178,6 +178,28 @@ async def test_a_forecast_that_fails_says_why_and_the_frame_counts(
         assert not fine.HasField("error")
 
 
+@pytest.mark.parametrize("delivery", ["STREAM_DELIVERY_ALL", "STREAM_DELIVERY_LATEST"])
+async def test_options_that_mean_nothing_are_a_fault_of_their_frame(
+    channel: grpc.aio.Channel, delivery: str
+) -> None:
+    async with opened(channel, delivery=delivery, close_session_at_end=True) as (stream, _):
+        for sequence, one in enumerate(walking(3), 1):
+            options = pb.ForecastOptions(mode=99) if sequence == 2 else None  # type: ignore[arg-type]  # no such mode
+            message = pb.StreamFrame(sequence=sequence, frame=frame_message(one), options=options)
+            await stream.call.write(pb.StreamPredictRequest(frame=message))
+        await stream.call.done_writing()
+        replies = await stream.replies(3)
+        assert [result_view(one.result)["outcome"] for one in replies] == ["accepted"] * 3
+        refusal = status_refusal(replies[1].error)
+        assert (refusal.kind, refusal.fields) == ("INVALID_ARGUMENT", ("options.mode",))
+        assert "99" in refusal.message
+        assert not replies[1].HasField("forecast")
+        assert not replies[1].superseded
+        assert replies[2].HasField("forecast")
+        assert await stream.next() is grpc.aio.EOF
+        assert await stream.call.code() is grpc.StatusCode.OK
+
+
 async def test_frames_may_bring_options_of_their_own(channel: grpc.aio.Channel) -> None:
     async with opened(channel, forecast_every_frame=False) as (stream, ack):
         first, second = walking(2)
