@@ -17,11 +17,13 @@ from trajectron_service.messages import (
 from trajectron_service.scenes import ForecastTask, ModelFacts
 from trajectron_service.settings import Settings
 from trajectron_service.timebase import Grid, Timeline, head
-from trajectron_service.validation import FrameLimits, TypeRules, quoted
+from trajectron_service.validation import FrameLimits, TypeRules, quoted, text_fault
 
 SEED_BOUND = 2**63
 # Seeds drawn here survive JSON readers that hold numbers as doubles.
 _DRAWN_SEED_BOUND = 2**53
+# Every session keeps its own map.
+MAX_TYPE_MAP = 100
 _SESSION_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 # An agent unseen for less than this many intervals is only late.
 _LATE_INTERVALS = 2.0
@@ -202,7 +204,14 @@ def _seconds(field: str, value: float | None, default: float, most: float) -> fl
 
 
 def _check_type_map(type_map: Mapping[str, str], model: ModelFacts) -> None:
+    if len(type_map) > MAX_TYPE_MAP:
+        raise invalid(
+            "type_map", f"has {len(type_map)} entries; a type_map may have at most {MAX_TYPE_MAP}"
+        )
     for name, kind in type_map.items():
+        fault = text_fault(name, "an agent type")
+        if fault is not None:
+            raise invalid("type_map", f"the key {quoted(name)} {fault}")
         if kind not in model.speed_limits_mps:
             known = ", ".join(map(quoted, model.speed_limits_mps))
             raise invalid(

@@ -135,7 +135,10 @@ _UnknownTypes = Annotated[
 ]
 _TypeMap = Annotated[
     dict[str, str],
-    Field(description="From your agent types to the model's, for `unknown_types: map`."),
+    Field(
+        description="From your agent types to the model's, for `unknown_types: map`; at most 100 "
+        "entries, names of 1 to 128 characters."
+    ),
 ]
 
 

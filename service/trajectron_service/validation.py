@@ -98,12 +98,12 @@ def quoted(text: str) -> str:
     return json.dumps(text if len(text) <= _SHOWN_LENGTH else text[:_SHOWN_LENGTH] + "…")
 
 
-def text_fault(text: str) -> str | None:
-    """What is wrong with an id, if anything."""
+def text_fault(text: str, kind: str = "an id") -> str | None:
+    """What is wrong with an id, or another name of the ``kind`` said, if anything."""
     if not text:
-        return f"is missing; an id has 1 to {MAX_ID_LENGTH} characters"
+        return f"is missing; {kind} has 1 to {MAX_ID_LENGTH} characters"
     if len(text) > MAX_ID_LENGTH:
-        return f"has {len(text)} characters; an id has at most {MAX_ID_LENGTH}"
+        return f"has {len(text)} characters; {kind} has at most {MAX_ID_LENGTH}"
     try:
         text.encode()
     except UnicodeEncodeError:

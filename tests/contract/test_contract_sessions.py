@@ -282,6 +282,23 @@ async def test_unknown_types_follow_the_policy_of_the_session(driver: Driver) ->
         assert [node["type"] for node in nodes] == ["pedestrian", "pedestrian"]
 
 
+@pytest.mark.parametrize("names", [[f"t{k}" for k in range(101)], ["x" * 129], [""]])
+async def test_a_type_map_has_bounds(driver: Driver, names: list[str]) -> None:
+    type_map = dict.fromkeys(names, "pedestrian")
+    async with refused(driver, "INVALID_ARGUMENT") as refusal:
+        await driver.create_session(unknown_types="map", type_map=type_map)
+    assert refusal.value.fields == ("type_map",)
+    async with refused(driver, "INVALID_ARGUMENT") as refusal:
+        await driver.predict(walking(2), unknown_types="map", type_map=type_map)
+    assert refusal.value.fields == ("type_map",)
+
+
+async def test_a_type_map_within_its_bounds_is_kept_whole(driver: Driver) -> None:
+    type_map = dict.fromkeys([*(f"t{k}" for k in range(99)), "x" * 128], "pedestrian")
+    async with session(driver, unknown_types="map", type_map=type_map) as opened:
+        assert (await driver.get_session(opened))["type_map"] == type_map
+
+
 async def test_an_agent_back_after_the_timeout_starts_anew(driver: Driver) -> None:
     async with session(driver, agent_timeout_s=2 * DT_S) as opened:
         await driver.observe(opened, walking(3, agents=1))

@@ -138,21 +138,18 @@ async def test_a_message_over_the_limit_is_refused_and_one_below_is_read(
 
 
 async def test_the_limit_of_replies_is_ours_not_grpcs_default(channel: grpc.aio.Channel) -> None:
-    driver = GrpcDriver(channel)
-    names = [f"heavy-{k}" for k in range(4)]
-    heavy = {"x" * 1_600_000: "pedestrian"}
-    try:
-        for name in names[:3]:
-            await driver.create_session(name, unknown_types="map", type_map=heavy)
-        listed = await driver.stub.ListSessions(pb.ListSessionsRequest())
-        assert 4 * 2**20 < listed.ByteSize() < MAX_REPLY_BYTES
-        await driver.create_session(names[3], unknown_types="map", type_map=heavy)
-        error = await refusal_of(driver.stub.ListSessions(pb.ListSessionsRequest()))
-        assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        await still_answers(channel)
-    finally:
-        for name in names:
-            await driver.delete_session(name)
+    stub = GrpcDriver(channel).stub
+    options = pb.ForecastOptions(num_samples=1000, horizon=60, seed=1)
+
+    def request(agents: int) -> pb.PredictRequest:
+        frames = [frame_message(one) for one in walking(2, agents)]
+        return pb.PredictRequest(frames=frames, options=options)
+
+    large = await stub.Predict(request(10))
+    assert 4 * 2**20 < large.ByteSize() < MAX_REPLY_BYTES
+    error = await refusal_of(stub.Predict(request(15)))
+    assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+    await still_answers(channel)
 
 
 async def test_a_deadline_is_kept(channel: grpc.aio.Channel) -> None:

@@ -354,7 +354,9 @@ class SessionConfig(_message.Message):
 
     @_builtins.property
     def type_map(self) -> _containers.ScalarMap[_builtins.str, _builtins.str]:
-        """From the client's types to the model's, for UNKNOWN_TYPE_POLICY_MAP."""
+        """From the client's types to the model's, for UNKNOWN_TYPE_POLICY_MAP: at most
+        100 entries, names of 1 to 128 characters.
+        """
 
     def __init__(
         self,
