@@ -64,7 +64,7 @@ class HttpApi:
     async def create_session(self, request: Request) -> Response:
         """Opens a session: a scene whose graph the service keeps between frames."""
         body = await read_body(request, CreateSessionRequest, self._max_body_bytes)
-        session = await self._application.create_session(body.id or None, body.to_config())
+        session = await self._application.create_session(body.session_id or None, body.to_config())
         answer = _answer(
             request,
             lambda: encode.session_json(session),

@@ -175,10 +175,10 @@ class CreateSessionRequest(Body):
     """A new session, and how it reads its frames."""
 
     model_config = ConfigDict(
-        json_schema_extra={"examples": [{"id": "crossing-4", "agent_timeout_s": 4.0}]},
+        json_schema_extra={"examples": [{"session_id": "crossing-4", "agent_timeout_s": 4.0}]},
     )
 
-    id: str | None = Field(
+    session_id: str | None = Field(
         None,
         description="1 to 128 of `A-Z a-z 0-9 . _ -`; assigned by the server when absent.",
     )

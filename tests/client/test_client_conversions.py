@@ -235,7 +235,7 @@ def test_a_session_is_configured_alike_on_both_transports() -> None:
     assert message.session_id == "crossing-4"
     assert grpc_convert.session_config(message.config) == expected
     body = http_schemas.CreateSessionRequest.model_validate_json(orjson.dumps(operation.body()))
-    assert (body.id, body.to_config()) == ("crossing-4", expected)
+    assert (body.session_id, body.to_config()) == ("crossing-4", expected)
 
 
 def test_sessions_graphs_results_and_models_arrive_alike_on_both_transports() -> None:

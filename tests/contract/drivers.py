@@ -94,7 +94,7 @@ class HttpDriver:
         return _forecast(await self._ask("POST", "/predict", {"frames": frames, **fields}))
 
     async def create_session(self, session_id: str | None = None, **config: Any) -> Json:
-        body = config if session_id is None else {"id": session_id, **config}
+        body = config if session_id is None else {"session_id": session_id, **config}
         return await self._ask("POST", "/v1/sessions", body)
 
     async def get_session(self, session_id: str) -> Json:

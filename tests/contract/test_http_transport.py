@@ -47,7 +47,7 @@ async def test_forecasts_are_as_the_documentation_describes_them(
 async def test_other_answers_are_as_the_documentation_describes_them(
     http: httpx.AsyncClient,
 ) -> None:
-    created = await http.post("/v1/sessions", json={"id": "documented"})
+    created = await http.post("/v1/sessions", json={"session_id": "documented"})
     assert created.status_code == 201
     assert created.headers["location"] == "/v1/sessions/documented"
     answers.Session.model_validate_json(created.content)
@@ -96,7 +96,7 @@ async def test_every_answer_has_its_message(http: httpx.AsyncClient) -> None:
         return answer.content
 
     name = "message"
-    content = await ask("POST", "/v1/sessions", {"id": name})
+    content = await ask("POST", "/v1/sessions", {"session_id": name})
     assert pb.CreateSessionResponse.FromString(content).session.id == name
     content = await ask("POST", f"/v1/sessions/{name}:observe", {"frames": walking(2)})
     assert len(pb.ObserveResponse.FromString(content).results) == 2
@@ -168,6 +168,14 @@ async def test_mistyped_and_unknown_fields_are_named(
     assert (refusal.kind, refusal.code) == ("INVALID_ARGUMENT", "422")
     assert refusal.fields == (field,)
     assert field in refusal.message
+
+
+async def test_the_field_of_a_session_id_is_the_one_that_errors_name(
+    http: httpx.AsyncClient,
+) -> None:
+    refusal = http_refusal(await http.post("/v1/sessions", json={"session_id": "a b"}))
+    assert refusal.fields == ("session_id",)
+    assert http_refusal(await http.post("/v1/sessions", json={"id": "a"})).fields == ("id",)
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "1e999"])

@@ -102,7 +102,7 @@ def create_session(session_id: str | None, options: SessionOptions) -> Operation
     """Open a session."""
 
     def body() -> Json:
-        named = {} if session_id is None else {"id": session_id}
+        named = {} if session_id is None else {"session_id": session_id}
         return named | json_bodies.session_options(**options)
 
     return Operation(
