@@ -8,7 +8,8 @@ fixed delay: an idle batcher starts at once, and what arrives meanwhile forms th
   session takes turns with the others. Within a round the earliest deadline goes first.
 - **Cost.** A batch closes before the entry that would take it beyond ``max_batch_cost``; an
   entry that alone costs more runs alone.
-- **Dropping.** Entries that are cancelled or past their deadline never run.
+- **Dropping.** Entries that are cancelled or past their deadline never run, and leave their
+  place in the queue at once.
 - **Bounds.** A full queue refuses at once (``QueueFull``), with an estimate of when to retry.
 - **Faults.** When a batch raises, its entries run one by one; only the guilty ones fail.
 """
@@ -156,6 +157,9 @@ class Batcher(Generic[JobT, ResultT]):
             if entry.done.cancelled():
                 raise Expired("the deadline passed before the work was done") from error
             raise
+        finally:
+            if entry.done.cancelled():
+                self._forget(line_key, entry)
 
     async def run_alone(self, call: Callable[[], None]) -> None:
         """Runs something else on the batcher's thread, between batches."""
@@ -206,6 +210,16 @@ class Batcher(Generic[JobT, ResultT]):
                 entry.done.set_exception(Expired("the deadline passed in the queue"))
         self._waiting -= len(line.entries) - len(alive)
         line.entries = alive
+
+    def _forget(self, key: Hashable, entry: _Entry[JobT, ResultT]) -> None:
+        """Frees the place of an entry, unless a batch has taken or dropped it."""
+        line = self._lines.get(key)
+        if line is None or entry not in line.entries:
+            return
+        line.entries.remove(entry)
+        self._waiting -= 1
+        if not line.entries:
+            del self._lines[key]
 
     async def _do(self, batch: list[_Entry[JobT, ResultT]]) -> None:
         start = self._clock()

@@ -180,6 +180,51 @@ async def test_a_full_queue_refuses_at_once_and_says_when_to_come_back() -> None
         assert await batcher.submit("d") == "D"
 
 
+@pytest.mark.parametrize("key", [None, "s"])
+async def test_cancelled_work_frees_its_place_while_a_batch_runs(key: str | None) -> None:
+    async with busy(queue_size=2) as (batcher, gate):
+        gone, kept = (asyncio.create_task(batcher.submit(job, key=key)) for job in ("gone", "kept"))
+        await turns()
+        gone.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await gone
+        assert batcher.waiting == 1
+        new = asyncio.create_task(batcher.submit("new", key=key))
+        await turns()
+        assert batcher.waiting == 2
+        with pytest.raises(QueueFull):
+            await batcher.submit("beyond")
+        gate.open.set()
+        assert await asyncio.gather(kept, new) == ["KEPT", "NEW"]
+        assert batcher.waiting == 0
+
+
+async def test_work_that_expires_frees_its_place_while_a_batch_runs() -> None:
+    async with busy(queue_size=1) as (batcher, gate):
+        soon = asyncio.get_running_loop().time() + 0.01
+        with pytest.raises(Expired):
+            await batcher.submit("soon", deadline=soon)
+        kept = asyncio.create_task(batcher.submit("kept"))
+        await turns()
+        gate.open.set()
+        assert await kept == "KEPT"
+    assert gate.batches == [["first"], ["kept"]]
+
+
+async def test_a_queue_that_all_have_left_is_empty_and_works_on() -> None:
+    async with busy() as (batcher, gate):
+        tasks = [asyncio.create_task(batcher.submit("gone", key="s")) for _ in range(3)]
+        await turns()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        assert not batcher.waiting
+        assert not batcher._lines
+        gate.open.set()
+        assert await batcher.submit("next", key="s") == "NEXT"
+    assert gate.batches == [["first"], ["next"]]
+
+
 async def test_only_the_guilty_fail() -> None:
     gate = Gate()
     async with batching(gate) as batcher:
