@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -269,3 +270,13 @@ def test_wrong_use_is_one_clear_line_and_exit_code_2(
     assert code == 2
     assert expected in err
     assert "Traceback" not in out + err
+
+
+def test_bundled_models_are_listed_with_their_figures(cli: Cli) -> None:
+    """On validation data all of them, on a test set those that were kept from one."""
+    lines = cli("models").splitlines()
+    rows = {line.split()[0]: line for line in lines if line.strip().startswith("eth_ucy")}
+    assert len(rows) == 6 and len(re.findall(r"\d\.\d{3}/\d\.\d{3}", rows["eth_ucy*"])) == 1
+    for name, line in rows.items():
+        if name != "eth_ucy*":
+            assert len(re.findall(r"\d\.\d{3}/\d\.\d{3}", line)) == 2

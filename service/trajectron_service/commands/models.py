@@ -11,6 +11,7 @@ from trajectron_service.commands.options import out
 from trajectron_service.messages import ModelInfo
 
 _HASH_LETTERS = 8
+_JUDGED_SAMPLES = 20
 
 
 def models(
@@ -25,8 +26,8 @@ def models(
 ) -> None:
     """Lists models with their provenance and figures.
 
-    The figures are of the recordings' validation parts, on which a model was selected:
-    `trajectron evaluate` judges on test sets.
+    The figures are of the recordings' validation parts, on which a model was selected, and
+    of the test set that a leave-one-out model was kept from (`trajectron evaluate`).
 
     Examples:
     `trajectron models`
@@ -73,10 +74,10 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
 
     table = Table(
         box=SIMPLE_HEAD,
-        caption="*: the default. ADE/FDE: best of 20 samples on validation parts, metres.",
+        caption="*: the default. ADE/FDE: best of 20 samples per agent, metres.",
         caption_justify="left",
     )
-    for column in ("model", "steps", "modes", "ADE/FDE", "sha256"):
+    for column in ("model", "steps", "modes", "validation", "test", "sha256"):
         table.add_column(column, no_wrap=True)
     for column in ("agents", "trained on"):
         table.add_column(column, min_width=14)
@@ -85,7 +86,8 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
             f"{info.name}{'*' if info.is_default else ''}",
             f"{info.horizon} x {info.dt_s:g} s",
             str(info.latent_values),
-            _figures(info.provenance),
+            _validation_figures(info.provenance),
+            _test_figures(info.provenance),
             info.hash[:_HASH_LETTERS],
             ", ".join(info.agent_types),
             ", ".join(_recordings(info.provenance)) or "not said",
@@ -93,13 +95,25 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
     out.print(table)
 
 
-def _figures(provenance: Mapping[str, object]) -> str:
+def _validation_figures(provenance: Mapping[str, object]) -> str:
     """Best of 20 on validation data, where the provenance has it."""
     figures = _mapping(_mapping(provenance.get("selected")).get("validation_figures"))
-    ade, fde = figures.get("min_ade_20"), figures.get("min_fde_20")
-    if not isinstance(ade, float) or not isinstance(fde, float):
-        return "not said"
-    return f"{ade:.3f}/{fde:.3f}"
+    return _errors(figures.get("min_ade_20"), figures.get("min_fde_20")) or "not said"
+
+
+def _test_figures(provenance: Mapping[str, object]) -> str:
+    """Best of 20 on the test set, where the model was judged on one."""
+    best_of = _mapping(_mapping(provenance.get("evaluation")).get("errors_m")).get("best_of")
+    for row in best_of if isinstance(best_of, list) else ():
+        if _mapping(row).get("n") == _JUDGED_SAMPLES:
+            errors = _mapping(_mapping(row).get("per_agent"))
+            return _errors(errors.get("ade_m"), errors.get("fde_m"))
+    return ""
+
+
+def _errors(ade: object, fde: object) -> str:
+    known = isinstance(ade, float) and isinstance(fde, float)
+    return f"{ade:.3f}/{fde:.3f}" if known else ""
 
 
 def _recordings(provenance: Mapping[str, object]) -> list[str]:
