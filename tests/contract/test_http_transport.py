@@ -387,7 +387,7 @@ async def test_the_examples_of_the_documentation_work(http: httpx.AsyncClient) -
     [example] = schemas["PredictRequest"]["examples"]
     assert (await http.post("/predict", json=example)).status_code == 200
     [example] = schemas["CreateSessionRequest"]["examples"]
-    path = f"/v1/sessions/{example['id']}"
+    path = f"/v1/sessions/{example['session_id']}"
     assert (await http.post("/v1/sessions", json=example)).status_code == 201
     [example] = schemas["ObserveRequest"]["examples"]
     assert (await http.post(f"{path}:observe", json=example)).status_code == 200
