@@ -37,9 +37,9 @@ _STEP_POINTS = 20
 # Checking this many agents takes some milliseconds; then others have their turn on the loop.
 _AGENTS_PER_TURN = 2000
 _REFUSED = {
-    Outcome.OUT_OF_ORDER: "is {new:.17g}, before the newest frame's {newest:.17g}; frames go "
+    Outcome.OUT_OF_ORDER: "is {new!r}, before the newest frame's {newest!r}; frames go "
     "forward in time",
-    Outcome.CONFLICT: "is {new:.17g}, the newest frame's, whose content differs; a frame cannot "
+    Outcome.CONFLICT: "is {new!r}, the newest frame's, whose content differs; a frame cannot "
     "be changed",
 }
 

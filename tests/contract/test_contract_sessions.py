@@ -282,6 +282,12 @@ async def test_unknown_types_follow_the_policy_of_the_session(driver: Driver) ->
         assert [node["type"] for node in nodes] == ["pedestrian", "pedestrian"]
 
 
+async def test_times_are_told_as_they_were_sent(driver: Driver) -> None:
+    async with session(driver, walking(2)) as opened, refused(driver, "FRAME_OUT_OF_ORDER") as late:
+        await driver.observe(opened, [frame(0.1, agent("0"))])
+    assert "is 0.1, before the newest frame's 0.4;" in late.value.message
+
+
 @pytest.mark.parametrize("names", [[f"t{k}" for k in range(101)], ["x" * 129], [""]])
 async def test_a_type_map_has_bounds(driver: Driver, names: list[str]) -> None:
     type_map = dict.fromkeys(names, "pedestrian")
