@@ -18,7 +18,8 @@ from pydantic.json_schema import models_json_schema
 from starlette.responses import RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 
-from trajectron_service.http_errors import PROBLEM_JSON, Problem
+from trajectron_service.errors import ErrorKind, ServiceError, invalid
+from trajectron_service.http_errors import PROBLEM_JSON, Problem, problem_of
 from trajectron_service.http_schemas import (
     CreateSessionRequest,
     ObserveRequest,
@@ -54,6 +55,28 @@ _ERRORS: dict[int, str] = {
     503: "The service is starting or draining; try again, here or elsewhere.",
     504: "Not done before the deadline.",
 }
+_EXAMPLES: tuple[ServiceError, ...] = (
+    ServiceError(
+        ErrorKind.MALFORMED, "the body is not valid JSON: expected value at line 1 column 1"
+    ),
+    ServiceError(
+        ErrorKind.UNKNOWN_SESSION,
+        'session_id: "crossing-4" is unknown: it was never opened, was closed, or has expired',
+    ),
+    ServiceError(ErrorKind.SESSION_EXISTS, 'session_id: "crossing-4" is open already'),
+    ServiceError(
+        ErrorKind.TOO_LARGE,
+        "the body is larger than 16777216 bytes; send fewer frames or agents at a time",
+    ),
+    invalid("num_samples", "is 0; must be 1 to 2000"),
+    ServiceError(
+        ErrorKind.OVERLOADED, "the service is busy: too much work waits already; try again later"
+    ),
+    ServiceError(ErrorKind.INTERNAL, "a fault of the service; its log has more"),
+    ServiceError(ErrorKind.DRAINING, "the service is stopping; another replica may answer"),
+    ServiceError(ErrorKind.DEADLINE_EXCEEDED, "the deadline passed before the work was done"),
+)
+_EXAMPLE_OF_STATUS = {error.codes.http: problem_of(error).model_dump() for error in _EXAMPLES}
 _INTRODUCTION = """
 Watches scenes of moving agents and foretells the distribution of where each of them goes next.
 
@@ -69,7 +92,12 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "description": _ERRORS[status],
-            "content": {PROBLEM_JSON: {"schema": {"$ref": _REF.format(model="Problem")}}},
+            "content": {
+                PROBLEM_JSON: {
+                    "schema": {"$ref": _REF.format(model="Problem")},
+                    "example": _EXAMPLE_OF_STATUS[status],
+                }
+            },
             **({"headers": _RETRY_AFTER} if status in (429, 503) else {}),
         }
         for status in (*statuses, 500)

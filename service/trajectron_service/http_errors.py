@@ -8,7 +8,7 @@ from typing import Any
 
 import orjson
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
@@ -33,27 +33,6 @@ class Violation(BaseModel):
 class Problem(BaseModel):
     """An error, as RFC 9457 has it."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "type": "urn:trajectron:problem:INVALID_ARGUMENT",
-                    "title": "Invalid argument",
-                    "status": 422,
-                    "detail": "frames[0].agents[3].x: is nan; positions must be finite metres",
-                    "reason": "INVALID_ARGUMENT",
-                    "violations": [
-                        {
-                            "field": "frames[0].agents[3].x",
-                            "description": "is nan; positions must be finite metres",
-                        }
-                    ],
-                    "retryable": False,
-                }
-            ]
-        }
-    )
-
     type: str = Field(description="A URI of the kind of error; `about:blank` for plain HTTP ones.")
     title: str = Field(description="The kind of error in words.")
     status: int = Field(description="The HTTP status.")
@@ -74,7 +53,12 @@ def problem_response(error: ServiceError) -> Response:
         headers["Connection"] = "close"
     if error.codes.retryable:
         headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_s or 1.0)))
-    problem = Problem(
+    return _response(problem_of(error), headers)
+
+
+def problem_of(error: ServiceError) -> Problem:
+    """The body of ``problem_response``."""
+    return Problem(
         type=f"urn:trajectron:problem:{error.kind.value}",
         title=error.kind.value.replace("_", " ").capitalize(),
         status=error.codes.http,
@@ -86,7 +70,6 @@ def problem_response(error: ServiceError) -> Response:
         ],
         retryable=error.codes.retryable,
     )
-    return _response(problem, headers)
 
 
 def http_problem(error: HTTPException, path: str) -> Response:

@@ -146,7 +146,9 @@ def _sessions(api: HttpApi) -> APIRouter:
 def _operations(health: Health, metrics: Metrics) -> APIRouter:
     router = APIRouter(tags=["operations"])
 
-    @router.get("/healthz", response_model=answers.Status, operation_id="healthz")
+    @router.get(
+        "/healthz", response_model=answers.Status, summary="Liveness", operation_id="healthz"
+    )
     async def is_alive() -> Response:
         """Whether the process lives."""
         return json_response({"status": "ok"})
@@ -154,6 +156,7 @@ def _operations(health: Health, metrics: Metrics) -> APIRouter:
     @router.get(
         "/readyz",
         response_model=answers.Status,
+        summary="Readiness",
         operation_id="readyz",
         responses={503: {"model": answers.Status, "description": "Starting or draining."}},
     )
@@ -163,7 +166,7 @@ def _operations(health: Health, metrics: Metrics) -> APIRouter:
         status = "ok" if ready else health.phase.value
         return json_response({"status": status}, 200 if ready else 503)
 
-    @router.get("/metrics", operation_id="metrics", response_class=Response)
+    @router.get("/metrics", summary="Metrics", operation_id="metrics", response_class=Response)
     async def measurements() -> Response:
         """Gives metrics in the Prometheus text format."""
         return Response(metrics.render(), media_type=CONTENT_TYPE)

@@ -379,6 +379,8 @@ async def test_the_documentation_describes_everything(http: httpx.AsyncClient) -
             for code, answer in operation["responses"].items():
                 if code >= "400" and path.startswith(("/v1", "/predict")):
                     assert answer["content"].keys() == {"application/problem+json"}
+                    example = answer["content"]["application/problem+json"]["example"]
+                    assert str(example["status"]) == code
     assert schemas["Agent"]["required"] == ["id", "type", "x", "y"]
 
 
