@@ -95,7 +95,7 @@ def check(
 
 def quoted(text: str) -> str:
     """A client's text for a message: in quotes, escaped, shortened."""
-    return json.dumps(text if len(text) <= _SHOWN_LENGTH else text[:_SHOWN_LENGTH] + "…")
+    return json.dumps(text if len(text) <= _SHOWN_LENGTH else text[:_SHOWN_LENGTH] + "...")
 
 
 def text_fault(text: str, kind: str = "an id") -> str | None:

@@ -10,7 +10,7 @@ from tests.service.building import frame, observation
 from trajectron_service.errors import FieldViolation
 from trajectron_service.messages import Agent, Frame, UnknownTypes
 from trajectron_service.timebase import Grid, Timeline, advance
-from trajectron_service.validation import Checked, FrameLimits, TypeRules, check
+from trajectron_service.validation import Checked, FrameLimits, TypeRules, check, quoted
 
 EMPTY = Timeline(Grid.of(0.4, None, 2.0))
 LIMITS = FrameLimits(max_agents_per_frame=2000, max_agents_per_scene=4000, speed_tolerance=1.5)
@@ -22,6 +22,11 @@ def rules(policy: UnknownTypes = UnknownTypes.REJECT, **type_map: str) -> TypeRu
 
 def person(name: str = "7", x: float | None = 1.0, y: float | None = 2.0) -> Agent:
     return Agent(name, "pedestrian", x, y)
+
+
+def test_long_text_is_shortened_legibly() -> None:
+    assert quoted("x" * 64) == '"' + "x" * 64 + '"'
+    assert quoted("x" * 65) == '"' + "x" * 64 + '..."'
 
 
 def fault(one: Frame, timeline: Timeline = EMPTY, limits: FrameLimits = LIMITS) -> FieldViolation:
