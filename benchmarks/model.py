@@ -2,8 +2,8 @@
 
 Every figure stands beside its floor, measured in the same run, in turn: the products that
 the step or the rollout cannot do without, in float32, with the terms of z and h_enc taken
-out of the loop. What is reported is the ratio of medians; absolute times are for the
-machine at hand.
+out of the loop. What is reported is the median of the ratios pair by pair; absolute times
+are for the machine at hand.
 
     python benchmarks/model.py [--threads 2] [--repeats 7] [--json benchmarks/results/model.json]
 """

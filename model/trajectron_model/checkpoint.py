@@ -122,7 +122,7 @@ def describe(path: str | Path) -> Description:
         )
     except CheckpointError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{file}: not the JSON of a checkpoint: {error!r}") from error
 
 

@@ -3,15 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 # The fastest a person has run (Graubner & Nixdorf 2011; paper, section "The Trajectron").
 PEDESTRIAN_SPEED_LIMIT_MPS = 12.42
 MAX_HORIZON = 60
 MAX_SAMPLES = 2000
+
+# Bounds far beyond any use: a damaged file cannot ask for gigabytes.
+_LARGEST = {
+    "horizon": MAX_HORIZON,
+    "observed_steps": 1000,
+    "history_size": 1024,
+    "edge_size": 1024,
+    "attention_size": 1024,
+    "future_size": 1024,
+    "latent_values": 1024,
+    "latent_hidden_size": 1024,
+    "decoder_size": 2048,
+    "mixture_components": 256,
+}
+_RANGES = {
+    "dt_s": (1e-3, 60.0),
+    "radius_m": (1e-3, 1e4),
+    "heading_smoothing": (1e-3, 1.0),
+    "heading_min_speed_mps": (0.0, 1e3),
+    "sigma_min_mps": (1e-6, 1e3),
+    "sigma_max_mps": (1e-6, 1e3),
+}
+
+
+def _check_count(name: str, value: object, most: int) -> None:
+    if type(value) is not int or not 1 <= value <= most:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number from 1 to {most}")
+
+
+def _check_number(name: str, value: object, least: float, most: float) -> None:
+    number = type(value) in (int, float)
+    if not number or not least <= cast("float", value) <= most:
+        raise ValueError(f"{name} is {value!r}; it must be a number from {least:g} to {most:g}")
 
 
 @dataclass(frozen=True)
@@ -30,12 +62,10 @@ class NodeType:
     speed_scale_mps: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("a node type needs a name")
-        if not (math.isfinite(self.speed_limit_mps) and self.speed_limit_mps >= 0.0):
-            raise ValueError(f"speed_limit_mps of {self.name!r} must be finite and not negative")
-        if not (math.isfinite(self.speed_scale_mps) and self.speed_scale_mps > 0.0):
-            raise ValueError(f"speed_scale_mps of {self.name!r} must be finite and positive")
+        if type(self.name) is not str or not self.name:
+            raise ValueError("a node type needs a name, a text")
+        _check_number(f"speed_limit_mps of {self.name!r}", self.speed_limit_mps, 0.0, 1e4)
+        _check_number(f"speed_scale_mps of {self.name!r}", self.speed_scale_mps, 1e-3, 1e4)
 
     @property
     def stationary(self) -> bool:
@@ -104,21 +134,24 @@ class ModelConfig:
         names = self.node_types
         if not names or len(set(names)) != len(names):
             raise ValueError("types must be one or more distinct node types")
-        if not self.dt_s > 0.0:
-            raise ValueError("dt_s must be positive")
-        if not 1 <= self.horizon <= MAX_HORIZON:
-            raise ValueError(f"horizon must be 1 to {MAX_HORIZON} steps")
+        for name, most in _LARGEST.items():
+            _check_count(name, getattr(self, name), most)
+        for name, (least, largest) in _RANGES.items():
+            _check_number(name, getattr(self, name), least, largest)
+        if self.sigma_min_mps >= self.sigma_max_mps:
+            raise ValueError("sigma_min_mps must be below sigma_max_mps")
+        for value in (*self.addition_filter, *self.removal_filter):
+            _check_number("a filter's value", value, 0.0, 1.0)
         if not self.addition_filter or self.addition_filter[-1] != 1.0:
             raise ValueError("addition_filter must end at 1")
-        if not all(0.0 <= v <= 1.0 for v in (*self.addition_filter, *self.removal_filter)):
-            raise ValueError("filter values must lie in [0, 1]")
+        pairs = [frozenset((edge.first, edge.second)) for edge in self.radii]
+        if len(set(pairs)) != len(pairs):
+            raise ValueError("radii name a pair of types twice")
         for edge in self.radii:
             unknown = {edge.first, edge.second} - set(names)
             if unknown:
                 raise ValueError(f"radii name unknown types: {sorted(unknown)}")
-        for radius in (self.radius_m, *(edge.radius_m for edge in self.radii)):
-            if not (math.isfinite(radius) and radius > 0.0):
-                raise ValueError("radii must be finite and positive")
+            _check_number("radii", edge.radius_m, *_RANGES["radius_m"])
         if self.features not in ("heading", "world"):
             raise ValueError("features must be 'heading' or 'world'")
 

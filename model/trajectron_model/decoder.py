@@ -13,6 +13,7 @@ sensible start.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -23,8 +24,17 @@ from trajectron_model.gmm import BivariateMixture, choose, correlated
 from trajectron_model.integration import limit_speed
 
 _CORRELATION_BOUND = 0.98
-# Rows decoded at a time when sampling: the gates of a block stay in the processor's cache.
+# Rows decoded at a time without gradients: the gates of a block stay in the processor's cache,
+# and memory is bounded however many rollouts are asked for.
 _BLOCK_ROWS = 1024
+
+
+class Prepared(NamedTuple):
+    """The part of h_enc in every rollout of an agent, and what all of them begin with."""
+
+    gates: Tensor  # [N, 4 decoder_size]
+    state: Tensor  # [N, 2 decoder_size]
+    velocity: Tensor  # [N, 2] the last causal velocity, y_0
 
 
 class Start(NamedTuple):
@@ -33,7 +43,7 @@ class Start(NamedTuple):
     gates: Tensor  # [R, 4 decoder_size]
     hidden: Tensor  # [R, decoder_size]
     cell: Tensor  # [R, decoder_size]
-    velocity: Tensor  # [R, 2] the last causal velocity, y_0
+    velocity: Tensor  # [R, 2]
 
 
 class Decoder(nn.Module):
@@ -47,7 +57,6 @@ class Decoder(nn.Module):
         self.recurrent = nn.Linear(2 + size, 4 * size, bias=False)  # [y_{t-1}; h] -> gates
         self.gates_encoding = nn.Linear(encoding_size, 4 * size)
         self.gates_latent = nn.Embedding(config.latent_values, 4 * size)
-        # h_0 and c_0 are linear in [z; h_enc].
         self.start_encoding = nn.Linear(encoding_size, 2 * size)
         self.start_latent = nn.Embedding(config.latent_values, 2 * size)
         # Per component: weight logit, mean x, y, log scale x, y, correlation.
@@ -63,26 +72,25 @@ class Decoder(nn.Module):
         with torch.no_grad():
             self.gates_encoding.bias[self.size : 2 * self.size].fill_(1.0)
 
-    def start(self, encoding: Tensor, velocity: Tensor, agent: Tensor, latent: Tensor) -> Start:
-        """The beginning of rollouts.
+    def prepare(self, encoding: Tensor, velocity: Tensor) -> Prepared:
+        """What rollouts of N agents share, from h_enc [N, D] and last velocities [N, 2]."""
+        return Prepared(self.gates_encoding(encoding), self.start_encoding(encoding), velocity)
 
-        Args:
-            encoding: h_enc [N, D].
-            velocity: [N, 2] last velocity.
-            agent: [R] row of ``encoding`` of each rollout.
-            latent: [R] latent value of each rollout.
+    def start(self, prepared: Prepared, agent: Tensor, latent: Tensor) -> Start:
+        """The beginning of R rollouts: of agent [R] (a row of ``prepared``) under z [R].
+
+        h_0 and c_0 are linear in [z; h_enc], h_0 squashed as an LSTM's output is.
         """
-        gates = self.gates_encoding(encoding)[agent] + self.gates_latent(latent)
-        state = self.start_encoding(encoding)[agent] + self.start_latent(latent)
+        gates = prepared.gates[agent] + self.gates_latent(latent)
+        state = prepared.state[agent] + self.start_latent(latent)
         hidden, cell = state.split(self.size, dim=-1)
-        return Start(gates, torch.tanh(hidden), cell, velocity[agent])
+        return Start(gates, torch.tanh(hidden), cell, prepared.velocity[agent])
 
-    def start_all(self, encoding: Tensor, velocity: Tensor) -> Start:
-        """Rollouts of every latent value for each agent: R = N Z rows, agent by agent."""
-        nodes, values = encoding.shape[0], self.gates_latent.num_embeddings
-        latent = torch.arange(values, device=encoding.device).repeat(nodes)  # [N Z]
-        agent = torch.arange(nodes, device=encoding.device).repeat_interleave(values)
-        return self.start(encoding, velocity, agent, latent)
+    def every_latent(self, nodes: int) -> tuple[Tensor, Tensor]:
+        """Agents and latent values of all N Z rollouts, agent by agent: two tensors [N Z]."""
+        values, device = self.gates_latent.num_embeddings, self.head.weight.device
+        agent = torch.arange(nodes, device=device).repeat_interleave(values)
+        return agent, torch.arange(values, device=device).repeat(nodes)
 
     def cell(self, start: Start, velocity: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """One LSTM step after velocity [R, 2]; gates in the order input, forget, output, new."""
@@ -124,28 +132,31 @@ class Decoder(nn.Module):
         mixture = self.mixture(torch.stack(hidden, dim=1), previous)
         return mixture.log_prob(future)
 
-    def sample(self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
+    def sample(
+        self,
+        prepared: Prepared,
+        agent: Tensor,
+        latent: Tensor,
+        uniform: Tensor,
+        normal: Tensor,
+        limit: float,
+    ) -> Tensor:
         """Sampled velocities [R, H, 2].
 
         Args:
-            start: R rollouts.
+            prepared: N agents.
+            agent, latent: [R] of each rollout.
             uniform: [R, H] chooses components.
             normal: [R, H, 2] standard normals.
-            limit: [R] speed limit, in units of the speed scale; what is fed back is limited too.
+            limit: on speed, in units of the speed scale; what is fed back is limited too.
         """
-        parts = [
-            self._sample_block(
-                Start(*(column[rows] for column in start)),
-                uniform[rows],
-                normal[rows],
-                limit[rows],
-            )
-            for first in range(0, uniform.shape[0], _BLOCK_ROWS)
-            for rows in (slice(first, first + _BLOCK_ROWS),)
-        ]
-        return torch.cat(parts) if parts else normal
+        sampled = torch.empty_like(normal)
+        for rows in _blocks(len(agent)):
+            start = self.start(prepared, agent[rows], latent[rows])
+            sampled[rows] = self._sample_block(start, uniform[rows], normal[rows], limit)
+        return sampled
 
-    def _sample_block(self, start: Start, uniform: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
+    def _sample_block(self, start: Start, uniform: Tensor, normal: Tensor, limit: float) -> Tensor:
         h, c, velocity = start.hidden, start.cell, start.velocity
         rows = torch.arange(uniform.shape[0], device=uniform.device)
         steps = []
@@ -161,21 +172,31 @@ class Decoder(nn.Module):
             steps.append(velocity)
         return torch.stack(steps, dim=1)
 
-    def moments(self, start: Start, horizon: int, limit: Tensor) -> tuple[Tensor, Tensor]:
-        """A rollout on the mixture's mean: velocity means and increments' covariances.
+    def moments(self, prepared: Prepared, horizon: int, limit: float) -> tuple[Tensor, Tensor]:
+        """Rollouts of every latent value on the mixture's mean.
 
         At each step the mixture is merged to one Gaussian and its mean, limited to ``limit``
-        [R], is fed back.
+        (in units of the speed scale), is fed back.
 
         Returns:
-            mean [R, H, 2] and the covariance of the change of velocity [R, H, 3].
+            velocity means [N Z, H, 2] and the covariances of the changes of velocity
+            [N Z, H, 3].
         """
-        h, c, velocity = start.hidden, start.cell, start.velocity
-        means, covariances = [], []
-        for _ in range(horizon):
-            h, c = self.cell(start, velocity, h, c)
-            mean, covariance = self.mixture(h, velocity).moments()
-            velocity = limit_speed(mean, limit)
-            means.append(velocity)
-            covariances.append(covariance)
-        return torch.stack(means, dim=1), torch.stack(covariances, dim=1)
+        agent, latent = self.every_latent(len(prepared.velocity))
+        means = prepared.velocity.new_empty(len(agent), horizon, 2)
+        covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
+        for rows in _blocks(len(agent)):
+            start = self.start(prepared, agent[rows], latent[rows])
+            h, c, velocity = start.hidden, start.cell, start.velocity
+            for t in range(horizon):
+                h, c = self.cell(start, velocity, h, c)
+                mean, covariances[rows, t] = self.mixture(h, velocity).moments()
+                velocity = limit_speed(mean, limit)
+                means[rows, t] = velocity
+        return means, covariances
+
+
+def _blocks(rows: int) -> Iterator[slice]:
+    """Runs of rows that are decoded together."""
+    for first in range(0, rows, _BLOCK_ROWS):
+        yield slice(first, first + _BLOCK_ROWS)

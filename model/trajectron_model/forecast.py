@@ -143,6 +143,9 @@ def _rows(model: Trajectron, state: SceneState, request: ForecastRequest) -> lis
         stationary = [t.stationary for t in model.config.types]
         return [row for row, kind in enumerate(state.node_type.tolist()) if not stationary[kind]]
     row_of = {agent: row for row, agent in enumerate(state.ids)}
+    unknown = [agent for agent in request.agents if agent not in row_of]
+    if unknown:
+        raise KeyError(f"no agent {unknown[0]!r} in the scene")
     return [row_of[agent] for agent in request.agents]
 
 
@@ -262,9 +265,8 @@ def mode_moments(
     agent_type, dt_s = model.config.types[kind], model.config.dt_s
     nodes, values = encoding.shape[0], model.config.latent_values
     decoder, scale = model.node_model(kind).decoder, agent_type.speed_scale_mps
-    start = decoder.start_all(encoding, start_velocity(model, motion, kind))
-    limit = start.velocity.new_full((nodes * values,), agent_type.speed_limit_mps / scale)
-    velocity, increment = decoder.moments(start, horizon, limit)
+    prepared = decoder.prepare(encoding, start_velocity(model, motion, kind))
+    velocity, increment = decoder.moments(prepared, horizon, agent_type.speed_limit_mps / scale)
     if agent_type.stationary:
         increment = torch.zeros_like(increment)
     mean = integrate(velocity, dt_s) * scale  # [N Z, H, 2]
@@ -353,11 +355,9 @@ def _sample_offsets(
     """Sampled offsets [R, H, 2] in metres, world axes, of rows (agent [R], latent value [R])."""
     agent_type, networks = model.config.types[kind], model.node_model(kind)
     velocity = start_velocity(model, agents.motion, kind)
-    start = networks.decoder.start(agents.encoding, velocity, agent, modes)
+    prepared = networks.decoder.prepare(agents.encoding, velocity)
     limit = agent_type.speed_limit_mps / agent_type.speed_scale_mps
-    sampled = networks.decoder.sample(
-        start, component, normal, start.velocity.new_full((agent.shape[0],), limit)
-    )
+    sampled = networks.decoder.sample(prepared, agent, modes, component, normal, limit)
     angle = turn * (2.0 * math.pi)
     any_axis = torch.stack([angle.cos(), angle.sin()], dim=-1)
     axis = model.features.frame(agents.motion)[agent]

@@ -38,23 +38,6 @@ class BivariateMixture(NamedTuple):
         """Mean [..., 2] and covariance [..., 3] of the whole mixture."""
         return merge_moments(self.log_weights.exp(), self.mean, self.covariance())
 
-    def sample(self, uniform: Tensor, normal: Tensor) -> Tensor:
-        """One value for each batch element from given noise.
-
-        Args:
-            uniform: [...] in [0, 1): chooses the component.
-            normal: [..., 2] standard normal.
-
-        Returns:
-            [..., 2].
-        """
-        index = choose(self.log_weights.exp(), uniform)
-        pair = index[..., None, None].expand(*index.shape, 1, 2)
-        mean = self.mean.gather(-2, pair).squeeze(-2)
-        scale = self.scale.gather(-2, pair).squeeze(-2)
-        rho = self.correlation.gather(-1, index.unsqueeze(-1)).squeeze(-1)
-        return correlated(mean, scale, rho, normal)
-
 
 def choose(weights: Tensor, uniform: Tensor) -> Tensor:
     """The index [...] at which the cumulated weights [..., M] pass ``uniform`` [...]."""

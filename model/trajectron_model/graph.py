@@ -158,18 +158,18 @@ def modulation(age: Int64, gone: Int64, config: ModelConfig) -> NDArray[np.float
     return factor
 
 
-def influence(graph: Graph, node_type: Int64, config: ModelConfig) -> Tensor:
+def influence(graph: Graph, factors: NDArray[np.float32], node_type: Int64, kinds: int) -> Tensor:
     """min(sum of M over neighbours, 1) for each node and edge type (paper, edge modulation).
 
     Args:
         graph: over the same rows as ``node_type``.
+        factors: [E] the modulation of each edge.
         node_type: [N] type indices.
+        kinds: K.
 
     Returns:
         [N, K] float32.
     """
-    kinds = len(config.types)
-    factors = modulation(graph.age, graph.gone, config)
     key = graph.receiver * kinds + node_type[graph.sender]
     total = np.bincount(key, weights=factors, minlength=node_type.size * kinds)
     return torch.from_numpy(np.minimum(total, 1.0).astype(np.float32)).reshape(-1, kinds)

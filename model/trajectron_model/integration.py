@@ -14,10 +14,10 @@ def integrate(velocity: Tensor, dt_s: float) -> Tensor:
     return velocity.cumsum(dim=-2) * dt_s
 
 
-def limit_speed(velocity: Tensor, limit_mps: Tensor) -> Tensor:
-    """Velocities [..., 2] scaled down to at most ``limit_mps`` [...] where they exceed it."""
+def limit_speed(velocity: Tensor, limit: float) -> Tensor:
+    """Velocities [..., 2] scaled down to at most ``limit``, in their unit, where they exceed it."""
     speed = velocity.square().sum(dim=-1).sqrt()
-    factor = (limit_mps / speed.clamp_min(1e-9)).clamp_max(1.0)
+    factor = (limit / speed.clamp_min(1e-9)).clamp_max(1.0)
     return velocity * factor.unsqueeze(-1)
 
 

@@ -59,8 +59,9 @@ class NodeModel(nn.Module):
             known: [B, H] bool, true on a prefix.
         """
         nodes, horizon = known.shape
-        start = self.decoder.start_all(encoding, velocity)
-        values = start.gates.shape[0] // max(nodes, 1)
+        agent, latent = self.decoder.every_latent(nodes)
+        start = self.decoder.start(self.decoder.prepare(encoding, velocity), agent, latent)
+        values = self.decoder.gates_latent.num_embeddings
         each = self.decoder.log_prob(start, future.repeat_interleave(values, 0))  # [B Z, H]
         each = each.reshape(nodes, values, horizon)
         log_prob = torch.where(known.unsqueeze(1), each, 0.0).sum(dim=-1)  # [B, Z]

@@ -1,7 +1,8 @@
-"""Noise that depends on (seed, agent, step) alone: a counter-based generator (Salmon et al. 2011).
+"""Noise keyed by (seed, agent, step): a counter-based generator (Salmon et al. 2011).
 
 The same request gives an agent the same samples whatever else is in the scene or batch,
-in whatever order agents stand, on whichever machine.
+in whatever order agents stand, on whichever machine. Asking for another number of samples
+or steps is another request: fewer samples are not the first of more.
 """
 
 from __future__ import annotations

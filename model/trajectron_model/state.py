@@ -22,7 +22,7 @@ from torch import Tensor
 from trajectron_model.config import ModelConfig
 from trajectron_model.encoders import EncoderState, blank_encoder_state
 from trajectron_model.features import Kinematics, blank_kinematics
-from trajectron_model.graph import EMPTY_GRAPH, Graph
+from trajectron_model.graph import EMPTY_GRAPH, Graph, influence
 
 _FORMAT = 1
 
@@ -85,14 +85,16 @@ class SceneState(NamedTuple):
         receiver, sender = renumber[self.graph.receiver], renumber[self.graph.sender]
         stays = (receiver >= 0) & (sender >= 0)
         graph = Graph(receiver[stays], sender[stays], self.graph.age[stays], self.graph.gone[stays])
+        factors, node_type = self.modulation[stays], self.node_type[index]
+        kinds = self.influence.shape[1]
         return SceneState(
             ids=tuple(self.ids[row] for row in rows),
-            node_type=self.node_type[index],
+            node_type=node_type,
             motion=Kinematics(*(column[index] for column in self.motion)),
             encoder=EncoderState(*(column[index] for column in self.encoder)),
             graph=graph,
-            modulation=self.modulation[stays],
-            influence=self.influence[index],
+            modulation=factors,
+            influence=influence(graph, factors, node_type.cpu().numpy(), kinds).to(index.device),
             time_s=self.time_s,
         )
 
@@ -121,8 +123,8 @@ class SceneState(NamedTuple):
             head = json.loads(arrays["head"].tobytes())
             if head["format"] != _FORMAT:
                 raise ValueError(f"scene state of format {head['format']}, expected {_FORMAT}")
-            return SceneState(
-                ids=tuple(head["ids"]),
+            state = SceneState(
+                ids=tuple(map(str, head["ids"])),
                 node_type=torch.from_numpy(arrays["node_type"]),
                 motion=Kinematics(*(_column(arrays, "motion", n) for n in Kinematics._fields)),
                 encoder=EncoderState(
@@ -133,8 +135,14 @@ class SceneState(NamedTuple):
                 influence=torch.from_numpy(arrays["influence"]),
                 time_s=float(head["time_s"]),
             )
-        except (SafetensorError, KeyError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"these bytes are no scene state: {error}") from error
+        nodes, edges = len(state.ids), len(state.modulation)
+        if any(len(column) != nodes for column in _tensors(state).values()) or any(
+            len(column) != edges for column in state.graph
+        ):
+            raise ValueError("these bytes are no scene state: columns of unequal length")
+        return state
 
 
 def _column(arrays: dict[str, NDArray[np.generic]], group: str, name: str) -> Tensor:

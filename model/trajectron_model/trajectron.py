@@ -77,7 +77,8 @@ class Trajectron(nn.Module):
         ``dt_s`` apart.
 
         Raises:
-            ValueError: an agent type that the model does not know.
+            ValueError: an agent type that the model does not know, an id twice in a frame, a
+                position that is not finite.
         """
         if not states:
             return []
@@ -103,6 +104,8 @@ class Trajectron(nn.Module):
         for state, frame in zip(states, frames, strict=True):
             row_of = {agent: row for row, agent in enumerate(state.ids, start=first)}
             rows = [row_of[agent] for agent in frame.ids]
+            if len(set(rows)) != len(rows) or not np.isfinite(frame.positions).all():
+                raise ValueError("a frame's ids must be distinct and its positions finite")
             position[rows] = frame.positions
             present[rows] = True
             last = first + len(state.ids)
@@ -141,12 +144,13 @@ class Trajectron(nn.Module):
                 for new, old in zip(encoder, before.encoder, strict=True)
             )
         )
+        factors = graph.modulation(after.age, after.gone, config)
         return before._replace(
             motion=motion,
             encoder=encoder,
             graph=after,
-            modulation=graph.modulation(after.age, after.gone, config),
-            influence=graph.influence(after, node_type, config).to(device),
+            modulation=factors,
+            influence=graph.influence(after, factors, node_type, len(config.types)).to(device),
         )
 
     def _encode_step(

@@ -281,7 +281,8 @@ class Forecaster:
             mode=task.mode,
             seed=task.seed,
             reference_time=task.head.time_s,
-            time_offsets_s=tuple(facts.info.dt_s * (h + 1) for h in range(task.horizon)),
+            # Rounded: 3 * 0.4 is to read 1.2.
+            time_offsets_s=tuple(round(facts.info.dt_s * (h + 1), 9) for h in range(task.horizon)),
             agents=agents,
         )
 

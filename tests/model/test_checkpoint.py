@@ -114,6 +114,23 @@ def test_unknown_settings_and_formats_are_refused(saved: Path, model: Trajectron
         describe(saved)
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"), [("history_size", "32"), ("edge_size", None), ("decoder_size", 10**9)]
+)
+def test_settings_that_cannot_be_are_refused_before_anything_is_built(
+    saved: Path, model: Trajectron, setting: str, value: object
+) -> None:
+    rewrite(saved, model={**model.config.to_json(), setting: value})
+    with pytest.raises(CheckpointError, match=f"{setting} is "):
+        Checkpoint.load(saved)
+
+
+def test_bottomless_json_is_refused(saved: Path) -> None:
+    beside(saved, ".json").write_text("[" * 200_000)
+    with pytest.raises(CheckpointError, match="not the JSON of a checkpoint"):
+        describe(saved)
+
+
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     broken = Trajectron(ModelConfig())
     with torch.no_grad():
@@ -160,8 +177,17 @@ def test_configurations_survive_json() -> None:
         ({"dt_s": 0.0}, "dt_s"),
         ({"horizon": 61}, "horizon"),
         ({"addition_filter": (0.5,)}, "end at 1"),
-        ({"removal_filter": (1.5,)}, r"\[0, 1\]"),
-        ({"radius_m": float("inf")}, "radii"),
+        ({"removal_filter": (1.5,)}, "from 0 to 1"),
+        ({"radius_m": float("inf")}, "radius_m"),
+        ({"history_size": -4}, "history_size is -4"),
+        ({"history_size": "32"}, "history_size is '32'"),
+        ({"edge_size": None}, "edge_size is None"),
+        ({"decoder_size": 2_000_000}, "from 1 to 2048"),
+        ({"horizon": True}, "horizon is True"),
+        ({"heading_smoothing": "a"}, "heading_smoothing is 'a'"),
+        ({"sigma_min_mps": 0}, "sigma_min_mps"),
+        ({"sigma_min_mps": 8.0}, "below sigma_max_mps"),
+        ({"radii": (EdgeRadius("pedestrian", "pedestrian", 1.0),) * 2}, "twice"),
         ({"radii": (EdgeRadius("pedestrian", "dog", 1.0),)}, "dog"),
         ({"features": "polar"}, "features"),
     ],

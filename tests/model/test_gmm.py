@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from trajectron_model.gmm import BivariateMixture, choose, merge_moments
+from trajectron_model.gmm import BivariateMixture, choose, correlated, merge_moments
 
 
 def mixture(batch: int = 5, components: int = 4) -> BivariateMixture:
@@ -33,20 +33,14 @@ def test_density_is_that_of_torch_distributions() -> None:
     torch.testing.assert_close(ours.log_prob(value), theirs.log_prob(value))
 
 
-def test_samples_have_the_moments_of_the_mixture() -> None:
-    ours = mixture(batch=2)
-    random = torch.Generator().manual_seed(2)
-    count = 200_000
-    many = BivariateMixture(*(v.expand(count, *v.shape) for v in ours))
-    drawn = many.sample(
-        torch.rand(count, 2, generator=random), torch.randn(count, 2, 2, generator=random)
-    )
-    mean, covariance = ours.moments()
-    torch.testing.assert_close(drawn.mean(0), mean, atol=0.01, rtol=0.01)
-    for batch in range(2):
-        torch.testing.assert_close(
-            drawn[:, batch].T.cov(), full(covariance)[batch], atol=0.02, rtol=0.02
-        )
+def test_correlated_values_have_the_moments_asked_for() -> None:
+    ours = mixture(batch=1, components=3)
+    normal = torch.randn(400_000, 3, 2, generator=torch.Generator().manual_seed(2))
+    drawn = correlated(ours.mean[0], ours.scale[0], ours.correlation[0], normal)
+    torch.testing.assert_close(drawn.mean(0), ours.mean[0], atol=0.01, rtol=0.0)
+    for component in range(3):
+        expected = full(ours.covariance())[0, component]
+        torch.testing.assert_close(drawn[:, component].T.cov(), expected, atol=0.01, rtol=0.01)
 
 
 def test_merging_two_equal_halves_adds_the_spread_of_their_means() -> None:

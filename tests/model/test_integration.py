@@ -15,12 +15,12 @@ def test_integrating_true_velocities_gives_true_positions() -> None:
 
 def test_only_speeds_above_the_limit_are_scaled_down() -> None:
     velocity = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]])
-    limited = limit_speed(velocity, torch.tensor([2.5, 2.5, 0.0]))
+    limited = limit_speed(velocity, 2.5)
     torch.testing.assert_close(limited, torch.tensor([[1.5, 2.0], [0.3, 0.4], [0.0, 0.0]]))
 
 
 def test_a_limit_of_zero_means_standing_still() -> None:
-    assert limit_speed(torch.tensor([3.0, 4.0]), torch.tensor(0.0)).tolist() == [0.0, 0.0]
+    assert limit_speed(torch.tensor([3.0, 4.0]), 0.0).tolist() == [0.0, 0.0]
 
 
 def test_position_covariance_is_that_of_a_random_walk_in_velocity() -> None:

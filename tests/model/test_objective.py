@@ -117,9 +117,8 @@ def test_the_likelihood_is_of_the_true_velocities(network: Trajectron) -> None:
             for z in range(5):
                 previous = (turn @ encoded.motion.velocity[agent]).unsqueeze(0)
                 start = nodes.decoder.start(
-                    encoded.encoding,
-                    previous.expand(3, 2),
-                    torch.tensor([agent]),
+                    nodes.decoder.prepare(encoded.encoding[[agent]], previous),
+                    torch.tensor([0]),
                     torch.tensor([z]),
                 )
                 h, cell, log_prob = start.hidden, start.cell, torch.zeros(())

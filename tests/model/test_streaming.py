@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
-from trajectron_model.config import ModelConfig
+from trajectron_model.config import EdgeRadius, ModelConfig, NodeType
 from trajectron_model.history import History, find_edges
 from trajectron_model.state import SceneFrame, SceneState, stack
 from trajectron_model.trajectron import Trajectron
@@ -66,6 +68,23 @@ def test_streaming_equals_the_whole_history_pass(
         edges = find_edges(past, network.config).mask
         made_or_broken = np.diff(edges.astype(int), axis=0) != 0
         assert not past.present.all() and made_or_broken.sum() > 20
+
+
+@pytest.mark.parametrize("features", ["heading", "world"])
+def test_streaming_equals_it_for_other_inputs_and_radii_too(
+    crowd: SceneMaker, fold: Fold, features: Literal["heading", "world"]
+) -> None:
+    torch.manual_seed(2)
+    types = (NodeType("pedestrian"), NodeType("vehicle"), NodeType("obstacle", 0.0))
+    radii = (EdgeRadius("pedestrian", "vehicle", 5.0), EdgeRadius("vehicle", "vehicle", 1.0))
+    network = Trajectron(ModelConfig(types=types, features=features, radii=radii)).eval()
+    frames = crowd(types=MIXED)
+    state = fold(network, frames)
+    past, ids = as_history(frames, network.config)
+    with torch.no_grad():
+        whole = network.encode(past, np.arange(len(ids))).encoding
+    order = [ids.index(agent) for agent in state.ids]
+    torch.testing.assert_close(encoding(network, state), whole[order], atol=1e-5, rtol=0.0)
 
 
 def test_encoding_some_nodes_equals_encoding_all(
@@ -171,7 +190,37 @@ def test_truncated_bytes_are_refused(model: Trajectron, crowd: SceneMaker, fold:
         SceneState.from_bytes(data[:-100])
 
 
-def test_dropping_agents_equals_never_having_their_rows(
+@pytest.mark.parametrize("head", ["[]", "null", '{"format": 1, "ids": 3, "time_s": 0}'])
+def test_a_head_that_is_none_is_refused(model: Trajectron, head: str) -> None:
+    arrays = safetensors.numpy.load(model.initial_state().to_bytes())
+    arrays["head"] = np.frombuffer(head.encode(), dtype=np.uint8)
+    with pytest.raises(ValueError, match="no scene state"):
+        SceneState.from_bytes(safetensors.numpy.save(arrays))
+
+
+def test_more_ids_than_rows_are_refused(model: Trajectron, crowd: SceneMaker, fold: Fold) -> None:
+    state = fold(model, crowd())
+    longer = state._replace(ids=(*state.ids, "one more"))
+    with pytest.raises(ValueError, match="unequal length"):
+        SceneState.from_bytes(longer.to_bytes())
+
+
+@pytest.mark.parametrize("places", [[[0.0, 0.0], [np.nan, 1.0]], [[0.0, 0.0], [np.inf, 1.0]]])
+def test_places_that_are_not_finite_are_refused(
+    model: Trajectron, places: list[list[float]]
+) -> None:
+    frame = SceneFrame(0.0, ("a", "b"), ("pedestrian",) * 2, np.array(places))
+    with pytest.raises(ValueError, match="finite"):
+        model.step([model.initial_state()], [frame])
+
+
+def test_an_id_twice_in_a_frame_is_refused(model: Trajectron) -> None:
+    frame = SceneFrame(0.0, ("a", "a"), ("pedestrian",) * 2, np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="distinct"):
+        model.step([model.initial_state()], [frame])
+
+
+def test_dropping_agents_keeps_what_is_between_the_others(
     model: Trajectron, crowd: SceneMaker, fold: Fold
 ) -> None:
     state = fold(model, crowd(missing=0.0))
@@ -183,6 +232,17 @@ def test_dropping_agents_equals_never_having_their_rows(
     rows = [state.ids.index(agent) for agent in kept.ids]
     torch.testing.assert_close(kept.encoder.edge_h, state.encoder.edge_h[rows])
     assert state.keep(state.ids) is state
+
+
+def test_a_dropped_agent_influences_nobody_any_more(
+    mixed_model: Trajectron, crowd: SceneMaker, fold: Fold
+) -> None:
+    frames = crowd(types=MIXED, missing=0.0)
+    state = fold(mixed_model, frames)
+    receiver = state.edges()[0].receiver_id
+    alone = state.keep([receiver])
+    assert state.influence[state.ids.index(receiver)].sum() > 0.0
+    assert alone.influence.tolist() == [[0.0, 0.0, 0.0]]
 
 
 def test_stacking_keeps_every_edge_in_its_scene(

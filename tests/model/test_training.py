@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from trajectron_model.checkpoint import Checkpoint, CheckpointError
+from trajectron_model.checkpoint import Checkpoint, CheckpointError, write_atomically
 from trajectron_model.config import ModelConfig, NodeType
 from trajectron_model.data.readers import read_apolloscape
 from trajectron_model.data.recording import Recording
 from trajectron_model.forecast import ForecastRequest
+from trajectron_model.training import resuming
 from trajectron_model.training.examples import Examples, ExampleSettings
 from trajectron_model.training.settings import TrainSettings, presets
 from trajectron_model.training.trainer import Progress, train
@@ -105,17 +106,53 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path: 
             provenance={"task": "test"},
             observe=stop_at_six,
         )
-    rest = run(tmp_path / "cut", resume_from=True)
+    rest = run(tmp_path / "cut", resume=True)
     assert rest[0].step == 5, "it goes on after the last validation, at step 4"
     assert Checkpoint.load(tmp_path / "cut").sha256 == Checkpoint.load(tmp_path / "whole").sha256
+
+
+def test_a_save_that_is_cut_off_leaves_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "whole")
+    written: list[Path] = []
+
+    def fail_the_second_time(file: Path, content: bytes) -> None:
+        written.append(file)
+        if len(written) == 2:
+            file.with_name(file.name + ".partial").write_bytes(content[: len(content) // 2])
+            raise OSError("no space left on device")
+        write_atomically(file, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(resuming, "write_atomically", fail_the_second_time)
+        with pytest.raises(OSError, match="no space"):
+            run(tmp_path / "cut")
+    rest = run(tmp_path / "cut", resume=True)
+    assert rest[0].step == 5
+    assert Checkpoint.load(tmp_path / "cut").sha256 == Checkpoint.load(tmp_path / "whole").sha256
+
+
+def test_a_training_on_other_data_is_not_resumed(tmp_path: Path) -> None:
+    run(tmp_path)
+    with pytest.raises(ValueError, match="other settings or data"):
+        train(
+            SMALL,
+            QUICK,
+            [recording("secret")],
+            [recording("judge", seed=1)],
+            tmp_path,
+            provenance={},
+            resume=True,
+        )
 
 
 def test_a_training_of_other_settings_is_not_resumed(tmp_path: Path) -> None:
     run(tmp_path)
     with pytest.raises(ValueError, match="begun with other settings"):
-        run(tmp_path, replace(QUICK, learning_rate=0.5), resume_from=True)
+        run(tmp_path, replace(QUICK, learning_rate=0.5), resume=True)
     with pytest.raises(CheckpointError, match="no training to resume"):
-        run(tmp_path / "empty", resume_from=True)
+        run(tmp_path / "empty", resume=True)
 
 
 def test_the_best_weights_by_validation_are_kept(tmp_path: Path) -> None:
@@ -165,6 +202,31 @@ def test_examples_are_true_stretches_of_the_recording() -> None:
     assert batch.known[:, 0].all() and batch.past.present[-1, batch.rows].all()
 
 
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_inputs_of_an_example_are_causal(preset: str) -> None:
+    """What comes after the newest observed step changes nothing of what is observed."""
+    made, now = recording(), 9
+    later = made.position.copy()
+    later[made.step > now] += 3.0
+    config = replace(presets()[preset].model, horizon=5, observed_steps=4)
+    scenes = []
+    for version in (made, replace(made, position=later)):
+        examples = Examples([version], config, QUICK.examples, 0)
+        examples._starts = np.array([[0, now]])
+        scenes.append(examples._scene(np.random.default_rng(1), 4))
+    np.testing.assert_array_equal(scenes[0].past.position, scenes[1].past.position)
+    assert (scenes[0].future != scenes[1].future).any()
+
+
+def test_the_papers_inputs_are_places_in_the_world() -> None:
+    config = replace(presets()["paper"].model, horizon=5, observed_steps=4)
+    settings = replace(QUICK.examples, input_noise_m=0.0)
+    made = recording()
+    batch = Examples([made], config, settings, 0).batch(0)
+    places = {tuple(p) for p in made.position}
+    assert {tuple(p) for p in batch.past.position[-1, batch.rows]} <= places
+
+
 @pytest.mark.parametrize(
     ("broken", "reason"),
     [
@@ -196,7 +258,7 @@ def test_obstacles_are_context_and_never_targets(tmp_path: Path) -> None:
     made = recording(types=("pedestrian", "obstacle"))
     batch = Examples([made], config, QUICK.examples, 0).batch(0)
     assert (batch.past.node_type[batch.rows] == 0).all() and (batch.past.node_type == 1).any()
-    judge = recording("judge", seed=1)
+    judge = recording("judge", types=("pedestrian", "obstacle"), seed=1)
     checkpoint = train(config, QUICK, [made], [judge], tmp_path, provenance={})
     torch.manual_seed(QUICK.seed)
     before = Trajectron(config).state_dict()

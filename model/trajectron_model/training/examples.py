@@ -121,7 +121,7 @@ class Examples:
         kinds = self._types[number][agents]
         observed = ~np.isnan(position[:steps, :, 0]).all(axis=0)
         position, kinds = position[:, observed], kinds[observed]
-        position = self._augment(position, random)
+        position = self._augment(position, steps, random)
         present = ~np.isnan(position[..., 0])  # [T + H, N]
         known = np.logical_and.accumulate(present[steps:], axis=0)
         moves = np.array([not t.stationary for t in self.config.types])
@@ -136,15 +136,17 @@ class Examples:
         return Batch(History(past, present[:steps], kinds, scene), rows, future, known[:, rows].T)
 
     def _augment(
-        self, position: NDArray[np.float64], random: np.random.Generator
+        self, position: NDArray[np.float64], steps: int, random: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Centres, mirrors, turns and stretches a scene."""
-        position = position - np.nanmean(position, axis=(0, 1))
-        if self.config.features == "heading":
-            # Turns and shifts change nothing there.
-            mirror = self.settings.mirror and random.random() < 0.5
-            turn = np.array([[1.0, 0.0], [0.0, -1.0 if mirror else 1.0]])
-            position = position @ turn
+        """Mirrors and stretches a scene about the middle of its observed steps.
+
+        With ``world`` features places mean something: scenes stay where and as they were.
+        """
+        if self.config.features == "world":
+            return position
+        position = position - np.nanmean(position[:steps], axis=(0, 1))
+        if self.settings.mirror and random.random() < 0.5:
+            position = position * np.array([1.0, -1.0])
         if self.settings.scale:
             span = np.log1p(self.settings.scale)
             position = position * np.exp(random.uniform(-span, span))

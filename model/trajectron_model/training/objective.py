@@ -28,7 +28,7 @@ class ObjectiveSettings:
     Attributes:
         name: ``elbo``: E_q[log p(y|x,z)] - beta KL(q || p). ``marginal``: log sum_z p(z|x)
             p(y|x,z), with the recognition network fitted to the exact posterior beside it.
-        beta_start, beta_end: beta at the first step and from ``beta_steps`` of the training on.
+        beta_start, beta_end: beta at the first step, and after the ramp.
         beta_ramp: share of the training over which beta goes from start to end.
         label_noise_mps: standard deviation of noise on true velocities. Recorded tracks are
             smooth splines: without it the mixture spends itself on exactly equal velocities.
@@ -135,6 +135,9 @@ def _terms(model: Trajectron, target: _Targets, name: str, beta: float) -> LossT
     part = model.node_model(target.kind).likelihood(
         target.encoding, target.velocity, target.future, target.known
     )
+    # Densities over velocity in m/s, whatever the type's unit of speed inside the network.
+    jacobian = 2.0 * math.log(model.config.types[target.kind].speed_scale_mps)
+    part = part._replace(log_prob=part.log_prob - jacobian * part.steps.unsqueeze(-1))
     log_prob, log_prior, log_q = part.log_prob, part.log_prior, part.log_recognition
     nll = -torch.logsumexp(log_prior + log_prob, dim=-1)
     reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)

@@ -15,7 +15,7 @@ from trajectron_model.checkpoint import Checkpoint, save
 from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.features import WORLD_FEATURES, WorldFeatures
-from trajectron_model.training import resume
+from trajectron_model.training import resuming
 from trajectron_model.training.examples import Examples
 from trajectron_model.training.objective import LossTerms, loss_terms
 from trajectron_model.training.settings import TrainSettings
@@ -58,7 +58,7 @@ def train(
     provenance: dict[str, Any],
     observe: Observer = lambda _: None,
     device: str | None = None,
-    resume_from: bool = False,
+    resume: bool = False,
 ) -> Checkpoint:
     """Trains a model and leaves the best one, by validation, in ``folder``.
 
@@ -70,14 +70,14 @@ def train(
         provenance: task, data, licence note...; the recordings, settings and figures are added.
         observe: called after every step.
         device: ``cpu`` or ``cuda``; by default CUDA where there is one.
-        resume_from: go on with the training that ``folder`` holds.
+        resume: go on with the training that ``folder`` holds.
 
     Returns:
         The checkpoint as saved.
 
     Raises:
         ValueError: data that do not fit the configuration, nothing to validate on, or a
-            training in ``folder`` that was begun with other settings.
+            training in ``folder`` that was begun with other settings or data.
         CheckpointError: a training to resume whose files are damaged.
     """
     if settings.threads is not None:
@@ -91,14 +91,17 @@ def train(
     judge = Validation(validation, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
     folder.mkdir(parents=True, exist_ok=True)
-    identity = {"model": config.to_json(), "train": settings.to_json()}
-    run = resume.Run(step=0, best_step=0, best_score=float("inf"), identity=identity)
-    if resume_from:
-        run = resume.load(folder, model, optimiser, identity)
-    facts = {
-        **provenance,
+    recordings = {
         "training": {"recordings": [r.provenance for r in training]},
         "validation": {"recordings": [r.provenance for r in validation]},
+    }
+    identity = {"model": config.to_json(), "train": settings.to_json(), **recordings}
+    run = resuming.Run(step=0, best_step=0, best_score=float("inf"), identity=identity)
+    if resume:
+        run = resuming.load(folder, model, optimiser, identity)
+    facts = {
+        **provenance,
+        **recordings,
         "settings": settings.to_json(),
     }
     model.train()
@@ -113,7 +116,7 @@ def train(
                 run = run.with_best(figures.score)
                 selected = {"step": run.step, "validation_figures": figures._asdict()}
                 save(folder / CHECKPOINT_NAME, model, {**facts, "selected": selected})
-            resume.save(folder, model, optimiser, run)
+            resuming.save(folder, model, optimiser, run)
         observe(Progress(run.step, rate, terms, figures, run.best_step))
     return Checkpoint.load(folder / CHECKPOINT_NAME)
 
@@ -156,7 +159,6 @@ def _standardise(
             _, dense = recording.dense()
             wanted = np.array([t == name for t in recording.types])
             track = dense[:, wanted]
-            track = track - np.nanmean(track, axis=(0, 1)) if wanted.any() else track
             velocity = np.diff(track, axis=0, prepend=np.nan) / config.dt_s
             change = np.diff(velocity, axis=0, prepend=np.nan) / config.dt_s
             state = np.concatenate([track, velocity, change], axis=-1).reshape(-1, WORLD_FEATURES)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from trajectron_model import metrics
+from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window, sgan_windows
 from trajectron_model.predictor import TrajectronPredictor
@@ -22,7 +24,10 @@ _LOSS_BATCHES = 4
 
 
 class ValidationFigures(NamedTuple):
-    """Means over judged agents, then over recordings; metres, and nats a future for ``nll``."""
+    """Means over judged agents, then over recordings; metres.
+
+    ``nll`` is in nats a future, of densities over velocity in m/s, on a few batches.
+    """
 
     nll: float
     min_ade_20: float
@@ -58,27 +63,16 @@ class Validation:
         self, recordings: Sequence[Recording], model: Trajectron, max_agents: int = 150
     ) -> None:
         config = model.config
-        moves = {t.name for t in config.types if not t.stationary}
-        found = [
-            [
-                window
-                for window in sgan_windows(
-                    recording,
-                    observed=config.observed_steps,
-                    horizon=config.horizon,
-                    min_agents=1,
-                )
-                if set(window.types) <= moves
-            ]
-            for recording in recordings
-        ]
+        found = [_windows(recording, config) for recording in recordings]
         self.windows = [_thin(windows, max_agents) for windows in found if windows]
         if not self.windows:
             raise ValueError(
                 "the validation data has no agent that is seen for "
                 f"{config.observed_steps + config.horizon} steps on end"
             )
-        settings = ExampleSettings(short_history=0.0, long_history=0.0, mirror=False)
+        settings = ExampleSettings(
+            short_history=0.0, long_history=0.0, mirror=False, scale=0.0, input_noise_m=0.0
+        )
         self._examples = Examples(recordings, config, settings, _SEED)
 
     def figures(self, model: Trajectron, objective: ObjectiveSettings) -> ValidationFigures:
@@ -86,7 +80,7 @@ class Validation:
         model.eval()
         predictor = TrajectronPredictor(model, "in training")
         means = np.mean([_errors_of(predictor, windows) for windows in self.windows], axis=0)
-        terms = self._losses(model, objective)
+        terms = self._losses(model, replace(objective, label_noise_mps=0.0))
         model.train()
         nll, entropy, information = (
             float(np.mean([float(getattr(t, name)) for t in terms]))
@@ -106,6 +100,19 @@ class Validation:
                 )
                 for number in range(_LOSS_BATCHES)
             ]
+
+
+def _windows(recording: Recording, config: ModelConfig) -> list[Window]:
+    """Every window of a recording that judges agents that can move, and only those."""
+    moves = {t.name for t in config.types if not t.stationary}
+    windows = sgan_windows(
+        recording, observed=config.observed_steps, horizon=config.horizon, min_agents=1
+    )
+    kept = [
+        replace(window, judged=window.judged[[kind in moves for kind in window.types]])
+        for window in windows
+    ]
+    return [window for window in kept if len(window.judged)]
 
 
 def _errors_of(predictor: TrajectronPredictor, windows: Sequence[Window]) -> np.ndarray:

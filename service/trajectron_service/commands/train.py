@@ -133,7 +133,7 @@ def train(
                 provenance=facts,
                 observe=observe,
                 device=device,
-                resume_from=resume,
+                resume=resume,
             )
         except ValueError as error:
             raise UsageError(str(error)) from error

@@ -1,25 +1,24 @@
 """What an interrupted training goes on from: weights, optimiser moments, counters.
 
-Tensors are safetensors and the rest is JSON. Random numbers need no saving: every batch
-follows from the seed and its number.
+Tensors are safetensors, and the counters JSON in their metadata. Random numbers need no
+saving: every batch follows from the seed and its number.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 
 from trajectron_model.checkpoint import CheckpointError, write_atomically
 from trajectron_model.trajectron import Trajectron
 
-_TENSORS = "resume.safetensors"
-_COUNTERS = "resume.json"
+_FILE = "resume.safetensors"
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Run:
     step: int
     best_step: int
     best_score: float
-    identity: dict[str, Any]  # the settings that it was begun with
+    identity: dict[str, Any]  # the settings and data that it was begun with
 
     def after_step(self) -> Run:
         """One gradient step later."""
@@ -41,20 +40,14 @@ class Run:
 
 
 def save(folder: Path, model: Trajectron, optimiser: torch.optim.Optimizer, run: Run) -> None:
-    """Writes what ``load`` reads; the counters last, so that a torn write is not taken up."""
+    """Writes what ``load`` reads: one file, whole or not at all, so that nothing can be torn."""
     tensors = {f"model.{name}": value for name, value in model.state_dict().items()}
     for number, moments in optimiser.state_dict()["state"].items():
         for name, value in moments.items():
             tensors[f"optimiser.{number}.{name}"] = torch.as_tensor(value)
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    write_atomically(folder / _TENSORS, safetensors.torch.save(tensors))
-    counters = {
-        "step": run.step,
-        "best_step": run.best_step,
-        "best_score": run.best_score,
-        "identity": run.identity,
-    }
-    write_atomically(folder / _COUNTERS, json.dumps(counters, indent=1).encode())
+    content = safetensors.torch.save(tensors, metadata={"run": json.dumps(asdict(run))})
+    write_atomically(folder / _FILE, content)
 
 
 def load(
@@ -63,22 +56,17 @@ def load(
     """Puts model and optimiser where the training in ``folder`` stood.
 
     Raises:
-        ValueError: a training that was begun with other settings.
-        CheckpointError: missing or damaged files.
+        ValueError: a training that was begun with other settings or data.
+        CheckpointError: a missing or damaged file.
     """
     try:
-        counters = json.loads((folder / _COUNTERS).read_text())
-        tensors = safetensors.torch.load((folder / _TENSORS).read_bytes())
-        run = Run(
-            step=int(counters["step"]),
-            best_step=int(counters["best_step"]),
-            best_score=float(counters["best_score"]),
-            identity=counters["identity"],
-        )
-    except (OSError, KeyError, ValueError, SafetensorError) as error:
+        with safe_open(folder / _FILE, framework="pt") as file:
+            run = Run(**json.loads(file.metadata()["run"]))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: no training to resume: {error}") from error
     if run.identity != json.loads(json.dumps(identity)):
-        raise ValueError(f"{folder}: the training there was begun with other settings")
+        raise ValueError(f"{folder}: the training there was begun with other settings or data")
     model.load_state_dict(
         {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
     )
