@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: help install serve test check format protos clean
+.PHONY: help install serve test check format protos bench clean
 
 help: ## show this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-9s %s\n", $$1, $$2}'
@@ -46,6 +46,10 @@ format: $(INSTALLED) ## format the code and mend what the linter can
 
 protos: $(INSTALLED) ## generate the code of the contract and lint it
 	$(BIN)/python scripts/protos.py
+
+bench: $(INSTALLED) ## time the model beside its bare matrix products, on one thread and on two
+	$(BIN)/python benchmarks/model.py --threads 1 --json benchmarks/results/model-1-thread.json
+	$(BIN)/python benchmarks/model.py --threads 2 --json benchmarks/results/model-2-threads.json
 
 clean: ## remove the environment and every cache
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
