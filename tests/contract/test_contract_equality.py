@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -59,8 +60,11 @@ async def test_a_session_is_the_same_from_both_sides(drivers: tuple[Driver, Driv
         await grpc.observe("shared", frames[1:2])
         await http.observe("shared", frames[2:])
         one, other = [await driver.get_session("shared") for driver in drivers]
-        for name in ("create_time", "expire_time"):
-            assert one.pop(name)[:19] == other.pop(name)[:19]
+        created_at = [datetime.fromisoformat(seen.pop("create_time")) for seen in (one, other)]
+        assert abs(created_at[0] - created_at[1]) < timedelta(milliseconds=1)
+        # Looking at a session keeps it open: the later look sees it expire no earlier.
+        expires_at = [datetime.fromisoformat(seen.pop("expire_time")) for seen in (one, other)]
+        assert created_at[0] < expires_at[0] <= expires_at[1]
         assert_same(one, other)
         assert one["version"] == 4
         assert one["agent_timeout_s"] == created["agent_timeout_s"] == 3.5
