@@ -33,7 +33,7 @@ class Description:
     """What the JSON of a checkpoint says.
 
     Attributes:
-        name: the file's name without its suffix.
+        name: the files' name without suffix; of a folder's ``model``, the folder's name.
         sha256: of the weights' file, hexadecimal.
         config: of the model.
         provenance: task, data, split, seed, metrics, licence note, as JSON values.
@@ -54,7 +54,7 @@ class Checkpoint:
 
     @property
     def name(self) -> str:
-        """The file's name without its suffix."""
+        """See ``Description``."""
         return self.description.name
 
     @property
@@ -115,7 +115,7 @@ def describe(path: str | Path) -> Description:
         if values["format"] != FORMAT:
             raise CheckpointError(f"{file}: format {values['format']}, expected {FORMAT}")
         return Description(
-            name=stem.name,
+            name=_name(stem),
             sha256=str(values["sha256"]),
             config=ModelConfig.from_json(values["model"]),
             provenance=dict(values["provenance"]),
@@ -164,6 +164,11 @@ def _stem(path: str | Path) -> Path:
     if path.suffix in (".json", ".safetensors"):
         return path.with_suffix("")
     return path / "model" if path.is_dir() else path
+
+
+def _name(stem: Path) -> str:
+    # Training calls every model "model"; its folder tells them apart.
+    return stem.resolve().parent.name if stem.name == "model" else stem.name
 
 
 def _with_suffix(stem: Path, suffix: str) -> Path:

@@ -56,8 +56,12 @@ def test_any_of_the_files_names_the_checkpoint(saved: Path) -> None:
 
 
 def test_a_folder_is_its_model(tmp_path: Path, model: Trajectron) -> None:
-    save(tmp_path / "model", model, PROVENANCE)
-    assert registry.load(tmp_path).name == "model"
+    """And bears its name, so that two trainings can be served side by side."""
+    for name in ("street", "square"):
+        (tmp_path / name).mkdir()
+        save(tmp_path / name / "model", model, PROVENANCE)
+        assert registry.load(tmp_path / name).name == name
+        assert registry.load(tmp_path / name / "model.json").name == name
 
 
 @pytest.mark.parametrize("suffix", [".json", ".safetensors"])
