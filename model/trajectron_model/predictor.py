@@ -1,13 +1,14 @@
 """The contract that every predictor meets, and the Trajectron behind it.
 
-Shape letters: A judged agents of one window, S samples, H horizon steps, Z latent values.
+Shape letters: A judged agents of one window, S samples, H horizon steps, Z modes (the
+Trajectron's latent values).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,21 @@ _MAX_TRAJECTORIES = 25_000
 
 
 @dataclass(frozen=True)
+class PositionMixture:
+    """A Gaussian mixture over position for each judged agent and step, in the world.
+
+    Attributes:
+        probability: [A, Z] of the modes, summing to one.
+        mean: [A, Z, H, 2] metres.
+        covariance: [A, Z, H, 3] square metres: xx, xy, yy.
+    """
+
+    probability: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class WindowForecast:
     """A forecast of one window's judged agents, in the window's order, world positions.
 
@@ -29,11 +45,14 @@ class WindowForecast:
         samples: [S, A, H, 2] metres; independent of one another.
         mode_mean: [A, H, 2] metres, the mean of the most probable mode.
         mean: [A, H, 2] metres, the mean over all modes.
+        mixture: the analytic distribution of positions; None for a predictor that only
+            samples.
     """
 
     samples: NDArray[np.floating]
     mode_mean: NDArray[np.float64]
     mean: NDArray[np.float64]
+    mixture: PositionMixture | None = None
 
 
 class Predictor(Protocol):
@@ -49,6 +68,17 @@ class Predictor(Protocol):
         """A forecast of each window from its observed steps alone.
 
         The same arguments give the same forecasts, whichever windows stand beside.
+        """
+
+
+@runtime_checkable
+class DensityPredictor(Predictor, Protocol):
+    """A predictor whose likelihood of a whole trajectory is exact."""
+
+    def log_prob(self, windows: Sequence[Window]) -> list[NDArray[np.float64]]:
+        """[A] for each window: log density of the judged agents' true futures, nats.
+
+        Over positions in metres, all steps together; NaN where a future is not complete.
         """
 
 
@@ -129,7 +159,7 @@ class TrajectronPredictor:
 
 def _in_world(forecast: SceneForecast) -> WindowForecast:
     """Offsets from each agent's position as world positions."""
-    if forecast.samples is None or forecast.mean is None:
+    if forecast.samples is None or forecast.mean is None or forecast.covariance is None:
         raise ValueError("a forecast of windows needs samples and modes")
     origin = forecast.position[:, None, :]  # [A, 1, 2]
     probability = forecast.mode_probabilities.astype(np.float64)  # [A, Z]
@@ -137,4 +167,9 @@ def _in_world(forecast: SceneForecast) -> WindowForecast:
     mode_mean = forecast.mean[np.arange(len(best)), best]  # [A, H, 2]
     mean = np.einsum("az,azhi->ahi", probability, forecast.mean)  # [A, H, 2]
     samples = forecast.samples.transpose(1, 0, 2, 3)  # [S, A, H, 2]
-    return WindowForecast(samples + origin, mode_mean + origin, mean + origin)
+    mixture = PositionMixture(
+        probability / probability.sum(axis=1, keepdims=True),
+        forecast.mean + origin[:, None],
+        forecast.covariance.astype(np.float64),
+    )
+    return WindowForecast(samples + origin, mode_mean + origin, mean + origin, mixture)

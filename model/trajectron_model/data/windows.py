@@ -30,7 +30,11 @@ class Window:
         first: the first observed step.
         observed: number of observed steps.
         horizon: number of steps to foretell, right after the observed ones.
-        judged: [A] agents whose forecasts are judged, indices into the recording's ids.
+        judged: [A] agents whose forecasts are judged, indices into the recording's ids,
+            ascending.
+        in_best_of: [A] which of them best-of-N is over; None for all.
+        truth: the recording without the noise that ``recording`` was given; None where it
+            was given none.
     """
 
     recording: Recording
@@ -38,6 +42,8 @@ class Window:
     observed: int
     horizon: int
     judged: NDArray[np.int64] = field(repr=False)
+    in_best_of: NDArray[np.bool_] | None = field(default=None, repr=False)
+    truth: Recording | None = field(default=None, repr=False)
 
     @property
     def now(self) -> int:
@@ -60,21 +66,22 @@ class Window:
 
     def history(self) -> NDArray[np.float64]:
         """[A, T, 2] observed positions of the judged agents, metres; NaN where absent."""
-        return self._positions(self.first, self.first + self.observed)
+        return self._positions(self.recording, self.first, self.first + self.observed)
 
     def future(self) -> NDArray[np.float64]:
         """[A, H, 2] true positions of the judged agents, metres; NaN where absent."""
-        return self._positions(self.now + 1, self.now + 1 + self.horizon)
+        truth = self.recording if self.truth is None else self.truth
+        return self._positions(truth, self.now + 1, self.now + 1 + self.horizon)
 
-    def _positions(self, first: int, last: int) -> NDArray[np.float64]:
-        rows = self.recording.rows(first, last)
-        agent = self.recording.agent[rows]
+    def _positions(self, of: Recording, first: int, last: int) -> NDArray[np.float64]:
+        rows = of.rows(first, min(last, of.num_steps))
+        agent = of.agent[rows]
         column = np.searchsorted(self.judged, agent)
         known = column < len(self.judged)
         known[known] = self.judged[column[known]] == agent[known]
         positions = np.full((len(self.judged), last - first, 2), np.nan)
-        step = self.recording.step[rows] - first
-        positions[column[known], step[known]] = self.recording.position[rows][known]
+        step = of.step[rows] - first
+        positions[column[known], step[known]] = of.position[rows][known]
         return positions
 
 
