@@ -10,6 +10,8 @@ from collections.abc import Sequence
 _USER_ERRORS = {
     "trajectron_model.data.errors.DataError",
     "trajectron_model.checkpoint.CheckpointError",
+    "trajectron_model.evaluation.contenders.ContenderError",
+    "trajectron_model.evaluation.plan.PlanError",
     "trajectron_service.settings.SettingsError",
     "trajectron_service.errors.ServiceError",
     "trajectron_service.commands.errors.UsageError",

@@ -79,12 +79,12 @@ def test_a_model_and_constant_velocity_are_judged_side_by_side(
     assert "5 independent samples, seed 3" in printed
     assert "4 / 12" in printed  # windows and judged agents
     baseline, judged = content["rows"]
-    assert (baseline["name"], judged["name"]) == ("constant velocity", model)
+    assert (baseline["name"], judged["name"]) == ("constant-velocity", model)
     assert judged["sets"][0]["model_sha256"] == checkpoint.Checkpoint.load(model).sha256
     assert judged["in_sample"] is False
     for row in (baseline, judged):
-        error = row["mean"]["mean"]
-        assert f"{error['ade_m']:.3f}/{error['fde_m']:.3f}" in printed
+        ade, fde = (row["mean"]["metrics"][name]["value"] for name in ("ade_mean", "fde_mean"))
+        assert f"{ade:.3f}/{fde:.3f}" in printed
     assert run(*arguments, "--samples", "5", "--seed", "3", "--json", str(file)) == 0
     assert json.loads(file.read_text()) == content
 

@@ -1,50 +1,30 @@
-"""The harness: right figures by hand, an honest guard, a fingerprint, known results."""
+"""The harness: figures by hand, an honest guard, a fingerprint, runs that stop and go on."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from trajectron_model.baselines.constant_velocity import ConstantVelocity
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
-from trajectron_model.data.recording import Recording
-from trajectron_model.data.windows import Protocol, Window
-from trajectron_model.evaluate import (
-    BEST_OF,
-    Contender,
-    Entry,
-    EvaluationSet,
-    InSampleError,
-    evaluate,
-    judge,
-)
+from trajectron_model.data.windows import Window
+from trajectron_model.evaluation import contenders, run
+from trajectron_model.evaluation.contenders import Contender, ContenderError, InSampleError
+from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
+from trajectron_model.evaluation.results import Estimate, Evaluation
+from trajectron_model.evaluation.run import Cancelled, Progress
 from trajectron_model.predictor import Predictor, WindowForecast
-from trajectron_model.results import BestOf, Displacement, Evaluation
 
-SHORT = Protocol("short", observed=2, horizon=2, min_agents=2)
-
-
-def standing(name: str = "square", steps: int = 5) -> Recording:
-    """Two people who stand still at (0, 0) and (10, 0)."""
-    step, agent = np.indices((steps, 2)).reshape(2, -1)
-    return Recording.from_rows(
-        name=name,
-        dt_s=0.4,
-        start_time_s=0.0,
-        ids=["left", "right"],
-        types=["pedestrian"] * 2,
-        step=step,
-        agent=agent,
-        position=np.stack([10.0 * agent, np.zeros(len(agent))], axis=-1),
-        source_sha256=f"file of {name}",
-    )
+STEPS = 23  # four windows of the protocol sgan
 
 
 class Drifting:
-    """Samples that miss by given distances, at the first step by nothing, at the last in full."""
+    """Samples that miss by given distances, at the last step in full, before by nothing."""
 
     name = "drifting"
 
@@ -62,67 +42,112 @@ class Drifting:
         return [WindowForecast(one, one[0], one.mean(axis=0)) for one in samples]
 
 
-def entry(predictor: Predictor, *sets: str, sha256: str = "") -> Entry:
-    return Entry(predictor.name, {name: Contender(predictor, sha256) for name in sets})
-
-
-def square(*names: str) -> EvaluationSet:
-    return EvaluationSet("square", tuple(standing(name) for name in names or ("square",)))
-
-
 # The first sample suits the left, the second the right, the third both a little.
 MISSES_M = [[0.0, 9.0], [8.0, 1.0], [3.0, 3.0], [4.0, 4.0], [5.0, 5.0]]
 
 
-def test_scores_are_those_computed_by_hand() -> None:
-    evaluation = evaluate(
-        [entry(Drifting(MISSES_M), "square")], [square()], protocol=SHORT, samples=5
-    )
-    (row,) = evaluation.rows
-    assert row.mean == row.sets[0].scores
-    # The miss is at the last of two steps: ADE is half of FDE.
-    assert row.mean.mode_mean == Displacement(2.25, 4.5)  # sample 0: 0 and 9
-    assert row.mean.mean.ade_m == pytest.approx(2.1)
-    assert row.mean.mean.fde_m == pytest.approx(4.2)  # of 4 and 4.4
-    one, five = row.mean.best_of
-    assert one == BestOf(1, Displacement(2.1, 4.2), Displacement(2.1, 4.2))
-    assert five == BestOf(5, Displacement(0.25, 0.5), Displacement(1.5, 3.0))
+def write_square(file: Path, steps: int = STEPS, shift: float = 0.0) -> str:
+    """Two people who stand still at (1, 1) and (11, 1), as ETH/UCY text."""
+    rows = [
+        f"{10 * step}\t{agent + 1}\t{1.0 + 10.0 * agent + shift}\t1.0\n"
+        for step in range(steps)
+        for agent in range(2)
+    ]
+    file.write_text("".join(rows))
+    return str(file)
 
 
-def test_best_of_more_than_was_drawn_is_left_out() -> None:
-    evaluation = evaluate(
-        [entry(ConstantVelocity(), "square")], [square()], protocol=SHORT, samples=20
-    )
-    assert [best.n for best in evaluation.rows[0].mean.best_of] == [1, 5, 20]
+@pytest.fixture
+def square(tmp_path: Path) -> str:
+    return write_square(tmp_path / "square.txt")
 
 
-def test_the_mean_weighs_sets_alike_and_agents_within_them() -> None:
-    sets = [EvaluationSet("a", (standing(steps=9),)), EvaluationSet("b", (standing(),))]
-    first, second = Drifting([[1.0, 3.0]]), Drifting([[6.0, 6.0]])
-    family = Entry("family", {"a": Contender(first), "b": Contender(second)})
-    (row,) = evaluate([family], sets, protocol=SHORT, samples=1).rows
-    assert [one.scores.mean.fde_m for one in row.sets] == [2.0, 6.0]
-    assert row.mean.mean.fde_m == 4.0
+Stand = Callable[..., None]
 
 
-def test_small_batches_give_the_same_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    windows = SHORT.windows([standing(steps=12)])
-    whole = judge(ConstantVelocity(25), windows, samples=20, seed=3, best_of=(1, 5, 20))
-    monkeypatch.setattr("trajectron_model.evaluate._MAX_TRAJECTORIES", 1)
-    judged: list[int] = []
-    split = judge(
-        ConstantVelocity(25),
-        windows,
-        samples=20,
-        seed=3,
-        best_of=(1, 5, 20),
-        progress=judged.append,
-    )
-    assert judged == [1] * len(windows)
-    assert whole.best_of.shape == (2 * len(windows), 3, 2)
-    np.testing.assert_array_equal(whole.best_of, split.best_of)
-    np.testing.assert_array_equal(whole.joint_best_of, split.joint_best_of)
+@pytest.fixture
+def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
+    """Gives names of entries to predictors of a test's own."""
 
+    def names(**predictors: Predictor | Contender | Mapping[str, Predictor]) -> None:
+        def resolve(name: str, test_set: str) -> Contender:
+            found = predictors[name]
+            if isinstance(found, Mapping):
+                found = found[test_set]
+            return found if isinstance(found, Contender) else Contender(found)
+
+        monkeypatch.setattr(contenders, "resolve", resolve)
+
+    return names
+
+
+def plan(*files: str, **fields: object) -> EvaluationPlan:
+    given: dict[str, object] = {"entries": ("model",), "files": files, "samples": 5}
+    return EvaluationPlan(**(given | {"bootstrap": 100} | fields))  # type: ignore[arg-type]
+
+
+def values(evaluation: Evaluation, row: int = 0) -> dict[str, float]:
+    return {name: one.value for name, one in evaluation.rows[row].mean.metrics.items()}
+
+
+def test_scores_are_those_computed_by_hand(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=Drifting(MISSES_M))
+    found = values(run.run(plan(square), tmp_path / "work"))
+    # The miss is at the last of twelve steps: ADE is a twelfth of FDE.
+    assert found["fde_mode"] == pytest.approx(4.5)  # sample 0: 0 and 9
+    assert found["ade_mode"] == pytest.approx(4.5 / 12)
+    assert found["fde_mean"] == pytest.approx(4.2)  # of 4 and 4.4
+    assert found["min_fde_1"] == found["joint_fde_1"] == pytest.approx(4.2)
+    assert found["min_fde_5"] == pytest.approx(0.5)  # 0 and 1
+    assert found["joint_fde_5"] == pytest.approx(3.0)  # 3 and 3
+    assert found["joint_ade_5"] == pytest.approx(3.0 / 12)
+    assert found["miss_1"] == pytest.approx(0.8)  # all but 0 and 1 of ten
+    assert found["miss_5"] == 0.0
+    assert found["collision"] == 0.0
+    assert "nll_mixture" not in found
+    assert "min_fde_20" not in found  # five samples were drawn
+
+
+def test_horizon_steps_have_figures_of_their_own(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=Drifting(MISSES_M))
+    (row,) = run.run(plan(square), tmp_path / "work").rows
+    steps = [one.value for one in row.mean.by_step["distance_mean"] if one is not None]
+    assert steps == [0.0] * 11 + [pytest.approx(4.2)]
+    assert row.sets[0].scores.by_step.keys() == row.mean.by_step.keys()
+
+
+def test_sets_weigh_alike_in_the_mean_and_agents_in_the_pool(stand: Stand, tmp_path: Path) -> None:
+    files = write_square(tmp_path / "a.txt", 27), write_square(tmp_path / "b.txt", 23)
+    stand(model={"a": Drifting([[1.0, 3.0]]), "b": Drifting([[6.0, 6.0]])})
+    (row,) = run.run(plan(*files, samples=1), tmp_path / "work").rows
+    assert [one.scores.metrics["fde_mean"].value for one in row.sets] == [2.0, 6.0]
+    assert row.mean.metrics["fde_mean"].value == 4.0
+    # Eight windows and four.
+    assert row.pooled.metrics["fde_mean"].value == pytest.approx((2.0 * 8 + 6.0 * 4) / 12, 1e-5)
+    assert row.pooled.metrics["fde_mean"].agents == 24
+
+
+def test_intervals_are_of_windows(stand: Stand, square: str, tmp_path: Path) -> None:
+    """Agents differ, windows do not: resampling windows changes nothing."""
+    stand(model=Drifting(MISSES_M))
+    (row,) = run.run(plan(square), tmp_path / "work").rows
+    found = row.mean.metrics["fde_mode"]
+    assert found == Estimate(4.5, 4.5, 4.5, 8)
+
+
+def test_paired_tests_compare_entries_over_the_same_windows(
+    stand: Stand, square: str, tmp_path: Path
+) -> None:
+    noisy = ConstantVelocity(heading_noise_deg=25.0)
+    stand(one=Drifting([[1.0, 3.0]]), other=Drifting([[2.0, 4.5]]), noisy=noisy)
+    entries = ("one", "other", "noisy")
+    found = run.run(plan(square, entries=entries, samples=1), tmp_path / "work").comparisons
+    # Of the same difference in every window there is no spread to test against.
+    assert not [c for c in found if (c.first, c.second) == ("one", "other")]
+    assert {c.metric for c in found} <= {"ade_mean", "fde_mean", "min_ade_1", "min_fde_1"}
+
+
+# In sample or not.
 
 PROVENANCE: Mapping[str, object] = {
     "training": {"recordings": [{"name": "street", "part": "training", "sha256": "s"}]},
@@ -131,21 +156,20 @@ PROVENANCE: Mapping[str, object] = {
 
 
 @pytest.mark.parametrize("role", ["training", "validation"])
-@pytest.mark.parametrize(
-    "seen", [{"name": "square", "sha256": ""}, {"name": "other", "sha256": "file of square"}]
-)
-def test_a_model_is_not_judged_on_what_it_has_seen(role: str, seen: Mapping[str, str]) -> None:
+@pytest.mark.parametrize("by", ["name", "content"])
+def test_a_model_is_not_judged_on_what_it_has_seen(
+    role: str, by: str, stand: Stand, square: str, tmp_path: Path
+) -> None:
+    from trajectron_model.data.readers import read
+
+    sha256 = read(square).source_sha256
+    seen = {"name": "square", "sha256": ""} if by == "name" else {"name": "x", "sha256": sha256}
     provenance = {**PROVENANCE, role: {"recordings": [seen]}}
-    contender = Contender.of_model(ConstantVelocity(), "abc", provenance)
-    judged: list[int] = []
+    stand(model=Contender.of_model(ConstantVelocity(), "abc", provenance))
+    told: list[Progress] = []
     with pytest.raises(InSampleError, match="was trained or selected on square"):
-        evaluate(
-            [Entry("model", {"square": contender})],
-            [square("square", "yard")],
-            protocol=SHORT,
-            progress=judged.append,
-        )
-    assert judged == []
+        run.run(plan(square), tmp_path / "work", progress=told.append)
+    assert told == []
 
 
 @pytest.mark.parametrize(
@@ -153,82 +177,322 @@ def test_a_model_is_not_judged_on_what_it_has_seen(role: str, seen: Mapping[str,
     [{}, {"training": {"recordings": []}}, {**PROVENANCE, "training": {"recordings": ["square"]}}],
 )
 def test_a_model_that_does_not_say_counts_as_having_seen_all(
-    provenance: Mapping[str, object],
+    provenance: Mapping[str, object], stand: Stand, square: str, tmp_path: Path
 ) -> None:
-    contender = Contender.of_model(ConstantVelocity(), "abc", provenance)
+    stand(model=Contender.of_model(ConstantVelocity(), "abc", provenance))
     with pytest.raises(InSampleError, match="does not say what it was trained on"):
-        evaluate([Entry("model", {"square": contender})], [square()], protocol=SHORT)
+        run.run(plan(square), tmp_path / "work")
 
 
-def test_in_sample_on_request_marks_the_row() -> None:
-    contender = Contender.of_model(ConstantVelocity(), "abc", PROVENANCE)
-    model = Entry("model", {"street": contender, "square": contender})
-    sets = [square(), EvaluationSet("street", (standing("street"),))]
-    (row,) = evaluate([model], sets, protocol=SHORT, in_sample=True).rows
-    assert [one.in_sample for one in row.sets] == [False, True]
-    assert row.in_sample
-    clean = evaluate([model], sets[:1], protocol=SHORT)
-    assert not clean.rows[0].in_sample
-    marked = evaluate([model], sets, protocol=SHORT, in_sample=True)
+def test_in_sample_on_request_marks_the_row(stand: Stand, square: str, tmp_path: Path) -> None:
+    street = write_square(tmp_path / "street.txt", shift=1.0)
+    stand(model=Contender.of_model(ConstantVelocity(), "abc", PROVENANCE))
+    marked = run.run(plan(square, street, in_sample=True), tmp_path / "marked")
+    assert [one.in_sample for one in marked.rows[0].sets] == [False, True]
+    assert marked.rows[0].in_sample
     assert "model (in sample)" in marked.to_markdown()
+    clean = run.run(plan(square), tmp_path / "clean")
+    assert not clean.rows[0].in_sample
     assert "(in sample)" not in clean.to_markdown()
 
 
-def test_the_fingerprint_tells_apart_what_cannot_be_compared() -> None:
-    def fingerprint(recording: Recording, protocol: Protocol = SHORT) -> tuple[str, str]:
-        entries = [entry(ConstantVelocity(), "square")]
-        sets = [EvaluationSet("square", (recording,))]
-        (one,) = evaluate(entries, sets, protocol=protocol).fingerprint.sets
+# Names.
+
+
+def test_names_stand_for_baselines_and_bundled_models() -> None:
+    assert contenders.resolve("constant-velocity", "eth").predictor.name == "constant velocity"
+    family = contenders.resolve("leave-one-out", "hotel")
+    assert family.predictor.name == "eth_ucy-without-hotel"
+    assert family.sha256
+    assert family.seen
+    with pytest.raises(ContenderError, match="not for street; name a model"):
+        contenders.resolve("leave-one-out", "street")
+    with pytest.raises(ValueError, match="nowhere: neither a bundled model"):
+        contenders.resolve("nowhere", "eth")
+
+
+# The fingerprint.
+
+
+def test_the_fingerprint_tells_apart_what_cannot_be_compared(stand: Stand, tmp_path: Path) -> None:
+    stand(model=ConstantVelocity())
+    numbers = iter(range(99))
+
+    def fingerprint(shift: float = 0.0, **fields: object) -> tuple[str, str]:
+        folder = tmp_path / f"{next(numbers)}"
+        folder.mkdir()
+        file = write_square(folder / "square.txt", shift=shift)
+        (one,) = run.run(plan(file, samples=1, **fields), folder / "work").fingerprint.sets
         return one.data_sha256, one.windows_sha256
 
-    data, windows = fingerprint(standing())
-    assert fingerprint(standing()) == (data, windows)
-    moved = standing()
-    moved.position[0] += 1e-3
-    moved_data, moved_windows = fingerprint(moved)
-    assert moved_data != data
-    assert moved_windows == windows
-    longer_data, longer_windows = fingerprint(standing(), Protocol("short", observed=3, horizon=2))
-    assert longer_data == data
-    assert longer_windows != windows
+    data, windows = fingerprint()
+    assert fingerprint() == (data, windows)
+    assert fingerprint(jitter_m=0.1) == (data, windows)  # that is the plan's to say
+    assert fingerprint(shift=1e-3) != (data, windows)
+    assert fingerprint(shift=1e-3)[1] == windows
+    assert fingerprint(protocol="all") == (data, windows)  # here they cut the same windows
+    streamed, other = fingerprint(protocol="streaming")
+    assert (streamed == data, other == windows) == (True, False)
+    assert fingerprint(max_windows=2) != (data, windows)
 
 
-def test_the_result_is_plain_json() -> None:
-    evaluation = evaluate(
-        [entry(ConstantVelocity(), "square", sha256="abc")], [square()], protocol=SHORT, seed=9
+def test_the_selection_of_windows_is_named(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=ConstantVelocity())
+    found = run.run(plan(square, max_windows=2), tmp_path / "work").fingerprint
+    assert found.selection == "every 2nd"
+    assert (found.sets[0].windows, found.sets[0].agents) == (2, 4)
+
+
+# Running, stopping, going on.
+
+
+class Counting(ConstantVelocity):
+    """Counts what it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__(heading_noise_deg=25.0)
+        self.asked: list[int] = []
+
+    def predict(
+        self, windows: Sequence[Window], *, num_samples: int, seed: int
+    ) -> list[WindowForecast]:
+        self.asked.append(len(windows))
+        return super().predict(windows, num_samples=num_samples, seed=seed)
+
+
+@pytest.fixture
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One window a shard."""
+    monkeypatch.setattr(run, "_TRAJECTORIES", 1)
+
+
+@pytest.fixture
+def walkers(tmp_path: Path) -> str:
+    """Three who walk, so that noise on headings shows."""
+    random = np.random.default_rng(0)
+    walks = np.cumsum(random.normal([0.5, 0.0], 0.05, (STEPS, 3, 2)), axis=0) + 1.0
+    file = tmp_path / "walkers.txt"
+    rows = [
+        f"{10 * step}\t{agent + 1}\t{x:.4f}\t{y:.4f}\n"
+        for step, scene in enumerate(walks.tolist())
+        for agent, (x, y) in enumerate(scene)
+    ]
+    file.write_text("".join(rows))
+    return str(file)
+
+
+def test_a_run_goes_on_where_it_was_stopped(
+    stand: Stand, walkers: str, tmp_path: Path, small_shards: None
+) -> None:
+    asked = plan(walkers, samples=20)
+    whole = Counting()
+    stand(model=whole)
+    expected = run.run(asked, tmp_path / "whole")
+    assert whole.asked == [1, 1, 1, 1]
+    stopped = Counting()
+    stand(model=stopped)
+    done: list[Progress] = []
+    with pytest.raises(Cancelled):
+        run.run(
+            asked,
+            tmp_path / "work",
+            progress=done.append,
+            cancelled=lambda: done[-1].windows_done == 3,
+        )
+    assert stopped.asked == [1, 1, 1]
+    assert not (tmp_path / "work" / "result.json").exists()
+    with pytest.raises(ValueError, match="no evaluation was completed there"):
+        run.load(tmp_path / "work")
+    resumed = Counting()
+    stand(model=resumed)
+    assert run.run(asked, tmp_path / "work") == expected
+    assert resumed.asked == [1]
+    # Once more: nothing is left to do.
+    assert run.run(asked, tmp_path / "work") == expected
+    assert resumed.asked == [1]
+
+
+def test_figures_do_not_depend_on_how_the_work_is_cut(
+    stand: Stand, walkers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand(model=ConstantVelocity(heading_noise_deg=25.0))
+    asked = plan(walkers, samples=20)
+    whole = run.run(asked, tmp_path / "whole")
+    monkeypatch.setattr(run, "_TRAJECTORIES", 1)
+    assert run.run(asked, tmp_path / "cut") == whole
+    assert len(list((tmp_path / "whole" / "shards").iterdir())) == 1
+    assert len(list((tmp_path / "cut" / "shards").iterdir())) == 4
+
+
+def test_the_seed_chooses_samples_and_nothing_else(
+    stand: Stand, walkers: str, tmp_path: Path
+) -> None:
+    stand(model=ConstantVelocity(heading_noise_deg=25.0))
+    first, second = (
+        values(run.run(plan(walkers, samples=20, seed=seed), tmp_path / f"{seed}"))
+        for seed in (1, 2)
     )
-    content = json.loads(json.dumps(evaluation.to_json()))
-    assert content["fingerprint"]["protocol"]["observed"] == 2
-    assert content["fingerprint"]["seed"] == 9
-    assert content["fingerprint"]["sets"][0]["windows"] == 2
-    assert content["fingerprint"]["sets"][0]["agents"] == 4
-    assert content["rows"][0]["sets"][0]["model_sha256"] == "abc"
-    assert content["rows"][0]["mean"]["best_of"][2]["n"] == 20
+    assert first["fde_mean"] == second["fde_mean"]
+    assert first["min_fde_20"] != second["min_fde_20"]
 
 
-def test_what_cannot_be_evaluated_is_refused() -> None:
-    one = entry(ConstantVelocity(), "square")
-    with pytest.raises(ValueError, match="samples must be at least 1"):
-        evaluate([one], [square()], samples=0)
-    with pytest.raises(ValueError, match="same name"):
-        evaluate([one, one], [square()])
-    with pytest.raises(ValueError, match="square has no window of the protocol sgan"):
-        evaluate([one], [square()])
-    with pytest.raises(ValueError, match="one length"):
-        evaluate([], [])
+def test_a_folder_is_one_plans_own(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=ConstantVelocity())
+    run.run(plan(square), tmp_path / "work")
+    with pytest.raises(PlanError, match="holds the work of another plan"):
+        run.run(plan(square, seed=1), tmp_path / "work")
 
 
-@pytest.fixture(scope="module")
-def known(eth_ucy: EthUcy) -> Evaluation:
-    """Constant velocity, plain and with noise, on the five sets."""
-    sets = [EvaluationSet(name, tuple(eth_ucy.test(name))) for name in TEST_SETS]
-    plain, noisy = ConstantVelocity(), ConstantVelocity(heading_noise_deg=25)
-    return evaluate([entry(plain, *TEST_SETS), entry(noisy, *TEST_SETS)], sets)
+def test_another_models_shards_are_not_taken_up(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=Contender(ConstantVelocity(), "old weights"))
+    run.run(plan(square), tmp_path / "work")
+    changed = Counting()
+    stand(model=Contender(changed, "new weights"))
+    run.run(plan(square), tmp_path / "work")
+    assert changed.asked == [4]
 
 
-def test_constant_velocity_has_its_known_errors(known: Evaluation) -> None:
-    row = known.rows[0]
-    errors = {one.test_set: one.scores.mean for one in row.sets}
+def test_a_torn_shard_is_never_taken_for_a_whole_one(
+    stand: Stand, square: str, tmp_path: Path
+) -> None:
+    """A process that dies while it writes leaves a partial file, under another name."""
+    stand(model=Counting())
+    expected = run.run(plan(square), tmp_path / "whole")
+    (shard,) = (tmp_path / "whole" / "shards").iterdir()
+    torn = tmp_path / "work" / "shards" / (shard.name + ".partial")
+    torn.parent.mkdir(parents=True)
+    torn.write_bytes(shard.read_bytes()[:100])
+    assert run.run(plan(square), tmp_path / "work") == expected
+
+
+def test_progress_counts_windows_of_all_entries(
+    stand: Stand, square: str, tmp_path: Path, small_shards: None
+) -> None:
+    stand(first=ConstantVelocity(), second=ConstantVelocity())
+    told: list[Progress] = []
+    entries = ("first", "second")
+    run.run(plan(square, entries=entries), tmp_path / "work", progress=told.append)
+    assert [one.windows_done for one in told] == [0, 1, 2, 3, 4, 5, 6, 7, 8]
+    assert {one.windows_total for one in told} == {8}
+    assert (told[0].share, told[0].seconds_left) == (0.0, None)
+    assert (told[4].entry, told[4].share) == ("first", 0.5)
+    left = [one.seconds_left for one in told[1:]]
+    assert all(one is not None and one >= 0.0 for one in left)
+    assert (told[-1].share, left[-1]) == (1.0, 0.0)
+
+
+# What comes out.
+
+
+def test_the_result_goes_to_json_and_back(stand: Stand, walkers: str, tmp_path: Path) -> None:
+    stand(a=ConstantVelocity(), b=ConstantVelocity(heading_noise_deg=25.0))
+    asked = plan(walkers, entries=("a", "b"), samples=20, protocol="streaming", seed=9)
+    evaluation = run.run(asked, tmp_path / "work")
+    content = json.loads(json.dumps(evaluation.to_json(), allow_nan=False))
+    assert Evaluation.from_json(content) == evaluation
+    assert run.load(tmp_path / "work") == evaluation
+    assert content["fingerprint"]["plan"]["seed"] == 9
+    assert evaluation.comparisons
+    for wrong in ({}, {**content, "rows": [{}]}, {**content, "fingerprint": None}):
+        with pytest.raises(ValueError, match="not the JSON of an evaluation"):
+            Evaluation.from_json(wrong)
+
+
+def test_streaming_is_broken_down_by_observations(
+    stand: Stand, walkers: str, tmp_path: Path
+) -> None:
+    stand(model=ConstantVelocity())
+    (row,) = run.run(plan(walkers, protocol="streaming"), tmp_path / "work").rows
+    groups = {one.group: one.scores for one in row.sets[0].groups if one.by == "observations"}
+    # Three walkers, seen for 23 steps; at the last nobody has a future.
+    counts = {name: scores.metrics["ade_mean"].agents for name, scores in groups.items()}
+    assert counts == {
+        "1": 3, "2": 3, "3": 3, "at least 1": 66, "at least 2": 63, "at least 4": 57,
+        "at least 8": 45,
+    }  # fmt: skip
+    # Who was seen once is taken to stand still.
+    assert groups["1"].metrics["fde_mean"].value > 4.0 > groups["2"].metrics["fde_mean"].value
+    assert [one.group for one in row.groups] == [one.group for one in row.sets[0].groups]
+
+
+def test_csv_has_a_line_for_each_estimate(stand: Stand, square: str, tmp_path: Path) -> None:
+    stand(model=Drifting(MISSES_M))
+    lines = run.run(plan(square), tmp_path / "work").to_csv().splitlines()
+    assert lines[0] == "entry,set,group,metric,step,value,low,high,agents"
+    assert "model,square,,min_fde_5,,0.5,0.5,0.5,8" in lines
+    assert "model,mean,,distance_mode,12,4.5,4.5,4.5,8" in lines
+
+
+def test_agents_scores_can_be_had_after_a_run(
+    stand: Stand, square: str, tmp_path: Path, small_shards: None
+) -> None:
+    stand(model=Drifting(MISSES_M))
+    run.run(plan(square), tmp_path / "work")
+    scores = run.load_scores(plan(square), tmp_path / "work")["model", "square"]
+    assert scores.columns["fde_mode"].tolist() == [0.0, 9.0] * 4
+    assert scores.window.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert scores.agent.tolist() == ["1", "2"] * 4
+    assert scores.observations.tolist() == [8] * 8
+    next((tmp_path / "work" / "shards").iterdir()).unlink()
+    with pytest.raises(ValueError, match="1 of 4 shards are missing"):
+        run.load_scores(plan(square), tmp_path / "work")
+
+
+# Plans.
+
+
+def test_a_plan_goes_to_json_and_back() -> None:
+    asked = EvaluationPlan(entries=("a", "b"), sets=("eth",), protocol="paper", max_windows=7)
+    assert EvaluationPlan.from_json(json.loads(json.dumps(asked.to_json()))) == asked
+    assert (asked.samples_in_kde, asked.samples_drawn) == (2000, 2000)
+    assert dataclasses.replace(asked, protocol="sgan").samples_in_kde == 100
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"entries": []}, "entries must be one or more distinct names"),
+        ({"entries": ["a", "a"]}, "entries must be one or more distinct names"),
+        ({"entries": "abc"}, "entries must be a list of texts"),
+        ({"sets": []}, "give either sets or files"),
+        ({"files": ["a.txt"]}, "give either sets or files"),
+        ({"sets": [], "files": ["a/x.txt", "b/x.txt"]}, "distinct names; they are x, x"),
+        ({"protocol": "own"}, "protocol 'own' is none of sgan, all, streaming, paper"),
+        ({"samples": 0}, "samples must be a whole number from 1 to 2000; it is 0"),
+        ({"samples": 2.5}, "samples must be a whole number"),
+        ({"samples": True}, "samples must be a whole number"),
+        ({"seed": -1}, "seed must be"),
+        ({"kde_samples": 1}, "kde_samples must be"),
+        ({"jitter_m": float("nan")}, "jitter_m must be a number"),
+        ({"in_sample": "no"}, "in_sample must be a bool"),
+        ({"sample": 5}, "unknown fields: sample"),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused(fields: Mapping[str, object], reason: str) -> None:
+    with pytest.raises(PlanError, match=reason):
+        EvaluationPlan.from_json({"entries": ["a"], "sets": ["eth"], **fields})
+
+
+def test_what_cannot_be_evaluated_is_refused(stand: Stand, tmp_path: Path) -> None:
+    stand(model=ConstantVelocity())
+    short = write_square(tmp_path / "short.txt", 19)
+    with pytest.raises(PlanError, match="short has no window of the protocol sgan"):
+        run.run(plan(short), tmp_path / "work")
+
+
+def test_an_unknown_set_is_refused(stand: Stand, eth_ucy: EthUcy, tmp_path: Path) -> None:
+    stand(model=ConstantVelocity())
+    with pytest.raises(PlanError, match="unknown: moon; the test sets are eth, hotel"):
+        run.run(plan(sets=("eth", "moon")), tmp_path / "work", data=eth_ucy.folder)
+
+
+# Known results, on the real recordings.
+
+
+def test_constant_velocity_has_its_known_errors(eth_ucy: EthUcy, tmp_path: Path) -> None:
+    asked = EvaluationPlan(("constant-velocity",), sets=TEST_SETS, samples=1, bootstrap=100)
+    evaluation = run.run(asked, tmp_path, data=eth_ucy.folder)
+    (row,) = evaluation.rows
     expected = {
         "eth": (1.00, 2.23),
         "hotel": (0.32, 0.62),
@@ -236,19 +500,23 @@ def test_constant_velocity_has_its_known_errors(known: Evaluation) -> None:
         "zara1": (0.43, 0.96),
         "zara2": (0.33, 0.73),
     }
-    for name, (ade_m, fde_m) in expected.items():
-        assert errors[name].ade_m == pytest.approx(ade_m, abs=0.0055)
-        assert errors[name].fde_m == pytest.approx(fde_m, abs=0.0055)
-    assert row.mean.mean.ade_m == pytest.approx(0.520, abs=5e-4)
-    assert row.mean.mean.fde_m == pytest.approx(1.141, abs=5e-4)
-    assert "one trajectory" in known.to_markdown()
+    for one in row.sets:
+        ade_m, fde_m = expected[one.test_set]
+        assert one.scores.metrics["ade_mean"].value == pytest.approx(ade_m, abs=0.0055)
+        assert one.scores.metrics["fde_mean"].value == pytest.approx(fde_m, abs=0.0055)
+    assert row.mean.metrics["ade_mean"].value == pytest.approx(0.520, abs=5e-4)
+    assert row.mean.metrics["fde_mean"].value == pytest.approx(1.141, abs=5e-4)
+    assert "one trajectory" in evaluation.to_markdown()
 
 
-def test_constant_velocity_with_noise_has_its_known_best_of_n(known: Evaluation) -> None:
-    best = dict(zip(BEST_OF, known.rows[1].mean.best_of, strict=True))
-    assert best[20].per_agent.ade_m == pytest.approx(0.405, abs=0.003)
-    assert best[20].per_agent.fde_m == pytest.approx(0.853, abs=0.006)
-    assert best[100].per_agent.ade_m == pytest.approx(0.388, abs=0.003)
-    assert best[100].per_agent.fde_m == pytest.approx(0.814, abs=0.006)
-    assert best[100].joint.ade_m == pytest.approx(0.488, abs=0.005)
-    assert best[100].joint.fde_m == pytest.approx(1.014, abs=0.01)
+def test_constant_velocity_with_noise_has_its_known_best_of_n(
+    eth_ucy: EthUcy, tmp_path: Path
+) -> None:
+    entries = ("constant-velocity-noise",)
+    asked = EvaluationPlan(entries, sets=("eth", "hotel", "zara1"), samples=20, bootstrap=100)
+    (row,) = run.run(asked, tmp_path, data=eth_ucy.folder).rows
+    expected = {"eth": (0.86, 1.90), "hotel": (0.24, 0.46), "zara1": (0.31, 0.62)}
+    for one in row.sets:
+        ade_m, fde_m = expected[one.test_set]
+        assert one.scores.metrics["min_ade_20"].value == pytest.approx(ade_m, abs=0.015)
+        assert one.scores.metrics["min_fde_20"].value == pytest.approx(fde_m, abs=0.03)

@@ -5,7 +5,7 @@ Shape letters: T observed steps, H horizon steps, A judged agents.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,10 @@ from trajectron_model.data.recording import Recording
 
 if TYPE_CHECKING:
     from trajectron_model.state import SceneFrame
+
+
+AGENT_TIMEOUT_S = 2.0
+"""Who was unseen for longer is a new agent when seen again: the service's own default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,21 @@ class Window:
         """[T] the observed steps, with everyone visible in them, judged or context."""
         return [self.recording.frame(self.first + step) for step in range(self.observed)]
 
+    def observations(self) -> NDArray[np.int64]:
+        """[A] steps at which each judged agent was seen since it last (re)appeared.
+
+        Who was unseen for longer than ``AGENT_TIMEOUT_S`` has appeared anew: sessions of the
+        service have forgotten it by then.
+        """
+        seen = ~np.isnan(self.history()[..., 0])  # [A, T]
+        steps = np.arange(self.observed)
+        last = np.maximum.accumulate(np.where(seen, steps, -self.observed), axis=1)  # [A, T]
+        unseen_s = (steps[1:] - last[:, :-1]) * self.recording.dt_s
+        anew = seen[:, 1:] & (unseen_s > AGENT_TIMEOUT_S * (1.0 + 1e-9))
+        begin = np.where(anew, steps[1:], 0).max(axis=1, initial=0)  # [A]
+        count: NDArray[np.int64] = (seen & (steps >= begin[:, None])).sum(axis=1)
+        return count
+
     def history(self) -> NDArray[np.float64]:
         """[A, T, 2] observed positions of the judged agents, metres; NaN where absent."""
         return self._positions(self.recording, self.first, self.first + self.observed)
@@ -108,36 +127,6 @@ def sgan_windows(
         for first, begin, count in windows
         if count >= min_agents
     ]
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """Which windows are cut from recordings; see `sgan_windows`."""
-
-    name: str
-    observed: int = 8
-    horizon: int = 12
-    min_agents: int = 2
-
-    def windows(self, recordings: Iterable[Recording]) -> list[Window]:
-        """The windows of these recordings, in their order."""
-        return [
-            window
-            for recording in recordings
-            for window in sgan_windows(
-                recording,
-                observed=self.observed,
-                horizon=self.horizon,
-                min_agents=self.min_agents,
-            )
-        ]
-
-
-PROTOCOLS = {
-    protocol.name: protocol
-    for protocol in (Protocol("sgan", min_agents=2), Protocol("all", min_agents=1))
-}
-"""The leave-one-out protocols of Social GAN, and the same with single agents judged too."""
 
 
 def _stretches(recording: Recording, length: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from trajectron_model import metrics
+from trajectron_model.evaluation import metrics
 from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window, sgan_windows

@@ -1,9 +1,11 @@
-"""``trajectron evaluate``: models and constant velocity on ETH/UCY, side by side."""
+"""``trajectron evaluate``: models and baselines on recordings, side by side."""
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,15 +15,25 @@ from trajectron_service.commands.errors import UsageError
 from trajectron_service.commands.options import out
 
 if TYPE_CHECKING:
-    from trajectron_model.data.eth_ucy import EthUcy
-    from trajectron_model.evaluate import Contender, Entry, EvaluationSet
-    from trajectron_model.results import Evaluation
+    from trajectron_model.evaluation.plan import EvaluationPlan
+    from trajectron_model.evaluation.results import Evaluation
 
-LEAVE_ONE_OUT = "eth_ucy-without-{test_set}"
+_BASELINE = "constant-velocity"
 
 
 def evaluate(
     *,
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[FILE]...",
+            help="Recordings to judge on instead of ETH/UCY, each a set of its own: "
+            "CSV `time,id,type,x,y`, or ETH/UCY text.",
+            exists=True,
+            dir_okay=False,
+            readable=True,
+        ),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -35,33 +47,54 @@ def evaluate(
     ] = "eth,hotel,univ,zara1,zara2",
     model: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME|PATH", help="A model, judged on every set; may be repeated."),
+        typer.Option(
+            metavar="NAME|PATH",
+            help="A bundled model, a checkpoint or a baseline such as `kalman`, judged on every "
+            "set; may be repeated. Constant velocity is always beside.",
+        ),
     ] = None,
     leave_one_out: Annotated[
         bool,
         typer.Option(
             "--leave-one-out",
             help="On each set, the bundled model that was trained without it. "
-            "The default where no `--model` is given.",
+            "The default where neither `--model` nor a file is given.",
         ),
     ] = False,
     protocol: Annotated[
-        Literal["sgan", "all"],
+        Literal["sgan", "all", "streaming", "paper"],
         typer.Option(
             help="`sgan`: windows of 8 observed and 12 further steps with at least two people "
-            "present throughout; `all`: one suffices."
+            "present throughout; `all`: one suffices; `streaming`: every frame, everyone in it; "
+            "`paper`: chunks of 100 steps, as in the Trajectron's own evaluation."
         ),
     ] = "sgan",
     samples: Annotated[
         int, typer.Option(min=1, max=2000, help="Independent futures drawn for each agent.")
     ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the samples.")] = 0,
-    json_file: Annotated[
-        Path | None,
+    kde_samples: Annotated[
+        int | None,
         typer.Option(
-            "--json", metavar="FILE", dir_okay=False, help="Write the result there as JSON too."
+            min=2,
+            max=2000,
+            help="Those in kernel density estimates: 2000 under `paper`, else `--samples`.",
         ),
     ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the samples.")] = 0,
+    max_windows: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="At most N windows of each set: every k-th."),
+    ] = None,
+    jitter_m: Annotated[
+        float,
+        typer.Option(
+            "--jitter",
+            min=0.0,
+            max=10.0,
+            metavar="METRES",
+            help="Standard deviation of noise on observed positions, as a tracker has it.",
+        ),
+    ] = 0.0,
     in_sample: Annotated[
         bool,
         typer.Option(
@@ -69,103 +102,118 @@ def evaluate(
             help="Judge models on recordings they were trained on as well; their rows say so.",
         ),
     ] = False,
+    work: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            file_okay=False,
+            help="Keep the work there: the same command goes on where it was stopped.",
+        ),
+    ] = None,
+    json_file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", dir_okay=False, help="Write the result as JSON."),
+    ] = None,
+    csv_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--csv", metavar="FILE", dir_okay=False, help="Write every estimate as a line of CSV."
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", file_okay=False, help="Write a report there: HTML and Markdown, figures."
+        ),
+    ] = None,
 ) -> None:
-    """Judges models on the ETH/UCY benchmark, constant velocity beside them.
+    """Judges models and baselines on the same windows of ETH/UCY, or of recordings of yours.
 
-    Shows ADE/FDE in metres: of the point forecast in both forms, and of the best of 1, 5, 20
-    and 100 samples, chosen per agent and jointly per scene; for each set and as their mean.
+    Shows errors of the point forecast in both forms, of the best of 1, 5, 20 and 100 samples,
+    chosen per agent and jointly per scene, likelihoods, coverage and collisions; for each set
+    and as their mean. JSON and CSV have confidence intervals and every horizon step too.
 
-    Example: `trajectron evaluate --leave-one-out --sets zara1,zara2 --json results.json`
+    Example: `trajectron evaluate --leave-one-out --model kalman --sets zara1,zara2`
     """
-    from trajectron_model.data.eth_ucy import EthUcy
+    from trajectron_model.evaluation import tables
+    from trajectron_model.evaluation.plan import EvaluationPlan
 
-    recordings = EthUcy(data)
-    test_sets = _evaluation_sets(recordings, sets)
-    names = [test_set.name for test_set in test_sets]
-    models = list(dict.fromkeys(model or ()))
-    entries = _entries(names, models, leave_one_out or not models)
-    result = _judged(entries, test_sets, protocol, samples, seed, in_sample)
-    out.print(_heading(result), end="\n\n")
+    plan = EvaluationPlan(
+        entries=_entries(list(model or ()), leave_one_out, bool(files)),
+        sets=() if files else _names(sets),
+        files=tuple(str(file) for file in files or ()),
+        protocol=protocol,
+        samples=samples,
+        seed=seed,
+        in_sample=in_sample,
+        kde_samples=kde_samples,
+        max_windows=max_windows,
+        jitter_m=jitter_m,
+    )
+    with _folder(work) as folder:
+        result = _judged(plan, folder, data)
+        if report is not None:
+            _write_report(plan, result, folder, data, report)
+    out.print(tables.heading(result.fingerprint), markup=False, end="\n\n")
     out.print(result.to_markdown(), markup=False)
     if json_file is not None:
-        json_file.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+        json_file.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+    if csv_file is not None:
+        csv_file.write_text(result.to_csv(), encoding="utf-8")
 
 
-def _evaluation_sets(recordings: EthUcy, sets: str) -> list[EvaluationSet]:
-    from trajectron_model.evaluate import EvaluationSet
-
-    names = list(dict.fromkeys(name.strip() for name in sets.split(",") if name.strip()))
-    unknown = [name for name in names if name not in recordings.test_sets]
-    if unknown or not names:
-        known = ", ".join(recordings.test_sets)
-        wrong = f"unknown: {', '.join(unknown)}" if unknown else "none given"
-        raise UsageError(f"--sets: {wrong}; the test sets are {known}")
-    return [EvaluationSet(name, tuple(recordings.test(name))) for name in names]
+def _names(sets: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in sets.split(",") if name.strip()))
+    if not names:
+        raise UsageError("--sets: none given")
+    return names
 
 
-def _entries(names: Sequence[str], models: Sequence[str], leave_one_out: bool) -> list[Entry]:
+def _entries(models: Sequence[str], leave_one_out: bool, files: bool) -> tuple[str, ...]:
     """The rows: constant velocity first, then the family of bundled models, then the others."""
-    from trajectron_model.baselines.constant_velocity import ConstantVelocity
-    from trajectron_model.evaluate import Contender, Entry
-
-    baseline = ConstantVelocity()
-    entries = [Entry(baseline.name, {name: Contender(baseline) for name in names})]
-    if leave_one_out:
-        family = {name: _contender(LEAVE_ONE_OUT.format(test_set=name)) for name in names}
-        entries.append(Entry("eth_ucy, leave-one-out", family))
-    for model in models:
-        contender = _contender(model)
-        entries.append(Entry(model, dict.fromkeys(names, contender)))
-    return entries
-
-
-def _contender(model: str) -> Contender:
     from trajectron_model import registry
-    from trajectron_model.evaluate import Contender
-    from trajectron_model.predictor import TrajectronPredictor
+    from trajectron_model.evaluation.contenders import LEAVE_ONE_OUT
 
-    checkpoint = registry.load(model)
-    predictor = TrajectronPredictor(checkpoint.model, checkpoint.name)
-    return Contender.of_model(predictor, checkpoint.sha256, checkpoint.provenance)
+    family = leave_one_out or not (models or files)
+    usual = [registry.DEFAULT] if files and not models and not family else []
+    entries = [_BASELINE, *([LEAVE_ONE_OUT] if family else []), *usual, *models]
+    return tuple(dict.fromkeys(entries))
 
 
-def _judged(
-    entries: Sequence[Entry],
-    test_sets: Sequence[EvaluationSet],
-    protocol: str,
-    samples: int,
-    seed: int,
-    in_sample: bool,
-) -> Evaluation:
+@contextlib.contextmanager
+def _folder(work: Path | None) -> Iterator[Path]:
+    """Where the work is kept: the given folder, or one that goes with the command."""
+    if work is not None:
+        yield work
+        return
+    with tempfile.TemporaryDirectory(prefix="trajectron-evaluate-") as folder:
+        yield Path(folder)
+
+
+def _judged(plan: EvaluationPlan, folder: Path, data: Path | None) -> Evaluation:
     """The evaluation, with a progress bar over windows on a terminal."""
     from tqdm import tqdm
 
-    from trajectron_model.data.windows import PROTOCOLS
-    from trajectron_model.evaluate import InSampleError
-    from trajectron_model.evaluate import evaluate as judge
+    from trajectron_model.evaluation.contenders import InSampleError
+    from trajectron_model.evaluation.run import Progress, run
 
-    of = PROTOCOLS[protocol]
-    windows = sum(len(of.windows(test_set.recordings)) for test_set in test_sets)
-    with tqdm(total=windows * len(entries), unit=" windows", disable=None, leave=False) as bar:
+    with tqdm(unit=" windows", disable=None, leave=False) as bar:
+
+        def show(progress: Progress) -> None:
+            bar.total = progress.windows_total
+            bar.set_description(f"{progress.entry} on {progress.set}", refresh=False)
+            bar.update(progress.windows_done - bar.n)
+
         try:
-            return judge(
-                entries,
-                test_sets,
-                protocol=of,
-                samples=samples,
-                seed=seed,
-                in_sample=in_sample,
-                progress=bar.update,
-            )
+            return run(plan, folder, data=data, progress=show)
         except InSampleError as error:
             raise UsageError(f"{error} (--leave-one-out, --in-sample)") from error
 
 
-def _heading(result: Evaluation) -> str:
-    """The protocol in one line."""
-    of, fingerprint = result.fingerprint.protocol, result.fingerprint
-    return (
-        f"Protocol {of.name}: {of.observed} steps of {fingerprint.dt_s:g} s observed, "
-        f"{of.horizon} foretold; {fingerprint.samples} independent samples, "
-        f"seed {fingerprint.seed}; the mean weighs the sets alike."
-    )
+def _write_report(
+    plan: EvaluationPlan, result: Evaluation, folder: Path, data: Path | None, report: Path
+) -> None:
+    from trajectron_model.evaluation.report import write_report
+    from trajectron_model.evaluation.run import load_scores
+
+    write_report(result, load_scores(plan, folder, data=data), report)

@@ -1,0 +1,1 @@
+"""The evaluation harness: protocols, metrics, and one way to run them."""

@@ -1,0 +1,191 @@
+"""From the forecast of a window to what each of its judged agents scored.
+
+Shape letters: S samples, A judged agents, H horizon steps, Z modes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from trajectron_model.data.windows import Window
+from trajectron_model.evaluation import densities, metrics
+from trajectron_model.evaluation.scores import AgentScores, Float
+from trajectron_model.predictor import DensityPredictor, Predictor, WindowForecast
+
+BEST_OF = (1, 5, 20, 100)
+"""The N of best-of-N; those above the number of samples are left out."""
+
+BEST_AT_EACH_STEP = 20
+"""The N of best-of-N with the best chosen at every horizon step for itself."""
+
+PAIRED_SAMPLES = 100
+"""At most so many samples go into metrics of pairs (energy, collisions) and into the kernel
+estimates whose regions are measured: their cost grows with the square."""
+
+ERROR_SLICES = 20
+"""What is kept of the distribution of each agent's sample errors: the means of so many slices."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How forecasts are judged.
+
+    Attributes:
+        samples: drawn for each agent that count in best-of-N and metrics of pairs.
+        kde_samples: those in kernel density estimates; fewer than two for none.
+        seed: of the samples and of draws from forecast densities.
+    """
+
+    samples: int
+    kde_samples: int
+    seed: int
+
+    @property
+    def drawn(self) -> int:
+        """How many futures are drawn for each agent."""
+        return max(self.samples, self.kde_samples)
+
+    @property
+    def best_of(self) -> tuple[int, ...]:
+        """The N that there are samples for."""
+        return tuple(n for n in BEST_OF if n <= self.samples)
+
+
+def judge(
+    predictor: Predictor, windows: Sequence[Window], how: Judgement, *, first: int = 0
+) -> AgentScores:
+    """What every judged agent of some windows scored; all forecasts are held at once.
+
+    Args:
+        predictor: makes the forecasts.
+        windows: at least one.
+        how: see the class.
+        first: index of the first window among those of its set.
+    """
+    forecasts = predictor.predict(windows, num_samples=how.drawn, seed=how.seed)
+    exact: Sequence[Float | None] = [None] * len(windows)
+    if isinstance(predictor, DensityPredictor):
+        exact = predictor.log_prob(windows)
+    return AgentScores.concatenate(
+        [
+            _scores(index, window, forecast, log_prob, how)
+            for index, (window, forecast, log_prob) in enumerate(
+                zip(windows, forecasts, exact, strict=True), start=first
+            )
+        ]
+    )
+
+
+def _scores(
+    index: int, window: Window, forecast: WindowForecast, log_prob: Float | None, how: Judgement
+) -> AgentScores:
+    truth = window.future()
+    columns = _point_columns(forecast, truth)
+    columns |= _sample_columns(forecast.samples[: how.samples], truth, window.in_best_of, how)
+    columns |= _density_columns(window, forecast, truth, how)
+    paired = forecast.samples[: min(how.samples, PAIRED_SAMPLES)]
+    columns["energy"] = metrics.energy_score(paired, truth)
+    columns["collision"] = metrics.collision_share(paired, window.history()[:, -1])
+    if log_prob is not None:
+        columns["nll_exact"] = -log_prob
+    return AgentScores(
+        window=np.full(len(truth), index),
+        agent=np.array(window.ids, dtype=np.str_),
+        type=np.array(window.types, dtype=np.str_),
+        observations=window.observations(),
+        columns=columns,
+        sample_errors=_sample_errors(forecast.samples, truth),
+    )
+
+
+def _sample_errors(
+    samples: np.ndarray[tuple[int, ...], np.dtype[np.floating]], truth: Float
+) -> dict[str, Float]:
+    """See `AgentScores.sample_errors`: of all judged agents and of every sample drawn."""
+    distance = metrics.displacement(samples, truth)  # [S, A, H]
+    return {
+        "ade": metrics.sorted_slices(metrics.average_displacement(distance), ERROR_SLICES),
+        "fde": metrics.sorted_slices(metrics.final_displacement(distance), ERROR_SLICES),
+    }
+
+
+def _point_columns(forecast: WindowForecast, truth: Float) -> dict[str, Float]:
+    columns = {}
+    for form, point in (("mode", forecast.mode_mean), ("mean", forecast.mean)):
+        distance = metrics.displacement(point, truth)  # [A, H]
+        columns[f"ade_{form}"] = metrics.average_displacement(distance)
+        columns[f"fde_{form}"] = metrics.final_displacement(distance)
+        columns[f"distance_{form}"] = distance
+    return columns
+
+
+def _sample_columns(
+    samples: np.ndarray[tuple[int, ...], np.dtype[np.floating]],
+    truth: Float,
+    counts: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None,
+    how: Judgement,
+) -> dict[str, Float]:
+    """Best-of-N; only of agents that count, NaN for the others."""
+    agents = np.arange(len(truth)) if counts is None else np.flatnonzero(counts)
+    columns = {}
+    distance = metrics.displacement(samples[:, agents], truth[agents])  # [S, A', H]
+    errors = {
+        "ade": metrics.average_displacement(distance),
+        "fde": metrics.final_displacement(distance),
+    }  # [S, A']
+    for n in how.best_of:
+        for name, error in errors.items():
+            columns[f"min_{name}_{n}"] = metrics.best_of(error, n)
+            columns[f"joint_{name}_{n}"] = metrics.joint_best_of(error, n)
+        columns[f"miss_{n}"] = metrics.miss_rate(errors["fde"], n)
+    if how.samples >= BEST_AT_EACH_STEP:
+        flat = distance.reshape(len(samples), -1)  # [S, A' H]
+        best = metrics.best_of(flat, BEST_AT_EACH_STEP)
+        columns[f"min_distance_{BEST_AT_EACH_STEP}"] = best.reshape(distance.shape[1:])
+    return {name: _spread(column, agents, len(truth)) for name, column in columns.items()}
+
+
+def _spread(
+    column: Float, agents: np.ndarray[tuple[int, ...], np.dtype[np.int64]], total: int
+) -> Float:
+    """[A', ...] values of some agents as [A, ...] of all, NaN for the others."""
+    if len(agents) == total:
+        return column
+    every = np.full((total, *column.shape[1:]), np.nan)
+    every[agents] = column
+    return every
+
+
+def _density_columns(
+    window: Window, forecast: WindowForecast, truth: Float, how: Judgement
+) -> dict[str, Float]:
+    """Per step: densities at the truth, and highest-density regions against it."""
+    columns: dict[str, Float] = {}
+    mixture = forecast.mixture
+    random = _generator(window, how.seed)
+    if how.kde_samples > 1:
+        kde = densities.kde_log_density(forecast.samples[: how.kde_samples], truth)
+        columns["nll_kde"] = -kde
+    if mixture is not None:
+        columns["nll_mixture"] = -densities.mixture_log_density(mixture, truth)
+        distance = metrics.displacement(mixture.mean.transpose(1, 0, 2, 3), truth)  # [Z, A, H]
+        columns["brier_fde"] = metrics.brier_final_displacement(mixture.probability, distance)
+        regions = densities.highest_density_regions(mixture, truth, random)
+    elif how.drawn > 1:
+        regions = densities.kde_regions(forecast.samples[:PAIRED_SAMPLES], truth, random)
+    else:
+        return columns
+    for level, covered, area in zip(densities.LEVELS, *regions, strict=True):
+        columns[f"coverage_{100 * level:g}"] = covered
+        columns[f"area_{100 * level:g}"] = area
+    return columns
+
+
+def _generator(window: Window, seed: int) -> np.random.Generator:
+    """Draws that depend on the window alone, not on those beside it."""
+    key = f"{seed}/{window.recording.name}/{window.first}/{window.now}/regions".encode()
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(key).digest()[:16], "big"))

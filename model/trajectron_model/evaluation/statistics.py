@@ -1,0 +1,210 @@
+"""From agents' scores to estimates: means, bootstrap intervals over windows, paired t-tests.
+
+Agents of one window see the same scene, so windows are what is resampled and paired, with all
+of their agents. Windows overlap (stride 1 under ``sgan``), so neighbouring ones are not
+independent either: intervals and p-values are optimistic, and equally so for all entries.
+
+Shape letters: A agents, W windows, B resamplings, C columns (a metric, or one of its steps).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from trajectron_model.evaluation.metrics import mean_over_known
+from trajectron_model.evaluation.results import Estimate, Scores
+from trajectron_model.evaluation.scores import AgentScores, Float
+
+_INTERVAL = (2.5, 97.5)
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a column of a `Sample` is: a metric over all steps, or at one of them."""
+
+    metric: str
+    step: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The mean of every column over a group of agents, and its resamplings.
+
+    Attributes:
+        columns: what they are.
+        total, count: [1 + B, C] sums over agents and how many there are; row 0 of the agents
+            as they are, the others of resampled windows.
+    """
+
+    columns: tuple[Column, ...]
+    total: Float
+    count: Float
+
+    @classmethod
+    def of(
+        cls, scores: AgentScores, windows: int, resamplings: Float, chosen: NDArray[np.bool_]
+    ) -> Sample:
+        """The sample of some agents of a set.
+
+        Args:
+            scores: of the set's A agents.
+            windows: W, in the set.
+            resamplings: [B, W] how often each window is drawn; see `resample`.
+            chosen: [A] which agents.
+        """
+        columns, values = _flatten(scores)  # [A, C]
+        values, window = values[chosen], scores.window[chosen]
+        known = ~np.isnan(values)
+        total = _by_window(np.where(known, values, 0.0), window, windows)  # [W, C]
+        count = _by_window(known.astype(np.float64), window, windows)
+        weights = np.concatenate([np.ones((1, windows)), resamplings])  # [1 + B, W]
+        return cls(columns, weights @ total, weights @ count)
+
+    def scores(self) -> Scores:
+        """Its means with their intervals."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return _scores(self.columns, self.total / self.count, self.count[0])
+
+
+def pooled(samples: Sequence[Sample]) -> Scores:
+    """The scores of all agents of several sets, each agent weighing the same."""
+    columns = _common(samples)
+    total = np.sum([_pick(sample, columns).total for sample in samples], axis=0)
+    count = np.sum([_pick(sample, columns).count for sample in samples], axis=0)
+    return Sample(columns, total, count).scores()
+
+
+def mean_of_sets(samples: Sequence[Sample]) -> Scores:
+    """The mean of several sets' means, each set weighing the same."""
+    columns = _common(samples)
+    picked = [_pick(sample, columns) for sample in samples]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = np.mean([sample.total / sample.count for sample in picked], axis=0)
+    return _scores(columns, means, np.sum([sample.count[0] for sample in picked], axis=0))
+
+
+def resample(windows: int, times: int, seed: int, name: str) -> Float:
+    """How often each window is drawn in each of ``times`` draws with replacement: [B, W].
+
+    The same for every entry, so that what entries share cancels between them.
+
+    Args:
+        windows: W.
+        times: B.
+        seed: of the draws, together with ``name``.
+        name: of the set.
+    """
+    key = hashlib.sha256(f"{seed}/{name}/bootstrap".encode()).digest()
+    random = np.random.default_rng(int.from_bytes(key[:16], "big"))
+    drawn: NDArray[np.int64] = random.multinomial(windows, np.full(windows, 1 / windows), times)
+    return drawn.astype(np.float64)
+
+
+def window_means(scores: AgentScores, metric: str, windows: int) -> Float:
+    """[W] the mean of a metric over each window's agents; NaN where it is defined for nobody."""
+    column = scores.columns[metric]
+    values = mean_over_known(column) if column.ndim == 2 else column
+    known = ~np.isnan(values)
+    total = np.bincount(scores.window, np.where(known, values, 0.0), windows)
+    count = np.bincount(scores.window, known, windows)
+    means: Float = np.divide(total, count, out=np.full(windows, np.nan), where=count > 0)
+    return means
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """See `results.Comparison`."""
+
+    pairs: int
+    difference: float
+    t: float
+    p: float
+
+
+def paired_t_test(first: Float, second: Float) -> PairedTest | None:
+    """A two-tailed paired t-test; pairs with NaN are left out.
+
+    Args:
+        first, second: [W] means of the same windows under two entries.
+
+    Returns:
+        None where fewer than two pairs are left or all differences are equal, so that there is
+        no spread to measure against.
+    """
+    difference = first - second
+    difference = difference[~np.isnan(difference)]
+    if len(difference) < 2 or np.ptp(difference) == 0.0:
+        return None
+    test = stats.ttest_1samp(difference, 0.0)
+    return PairedTest(
+        len(difference),
+        _rounded(difference.mean()),
+        _rounded(float(test.statistic)),
+        _rounded(float(test.pvalue)),
+    )
+
+
+def _flatten(scores: AgentScores) -> tuple[tuple[Column, ...], Float]:
+    """All metrics as columns [A, C]: the mean over steps first, then each step."""
+    names: list[Column] = []
+    parts: list[Float] = []
+    for metric, values in sorted(scores.columns.items()):
+        names.append(Column(metric, None))
+        if values.ndim == 1:
+            parts.append(values[:, None])
+            continue
+        names += [Column(metric, step) for step in range(values.shape[1])]
+        parts += [mean_over_known(values)[:, None], values]
+    return tuple(names), np.concatenate(parts, axis=1)
+
+
+def _by_window(values: Float, window: NDArray[np.int64], windows: int) -> Float:
+    """[A, C] rows summed into [W, C]."""
+    total = np.zeros((windows, values.shape[1]))
+    np.add.at(total, window, values)
+    return total
+
+
+def _common(samples: Sequence[Sample]) -> tuple[Column, ...]:
+    """The columns that all samples have and that are defined for someone in each of them."""
+    defined = [
+        {column for column, n in zip(sample.columns, sample.count[0], strict=True) if n}
+        for sample in samples
+    ]
+    return tuple(c for c in samples[0].columns if all(c in one for one in defined))
+
+
+def _pick(sample: Sample, columns: Sequence[Column]) -> Sample:
+    place = {column: index for index, column in enumerate(sample.columns)}
+    index = [place[column] for column in columns]
+    return Sample(tuple(columns), sample.total[:, index], sample.count[:, index])
+
+
+def _scores(columns: Sequence[Column], means: Float, count: Float) -> Scores:
+    """Estimates from means [1 + B, C] and counts of agents [C]."""
+    defined = np.flatnonzero(count)
+    # A resampling can miss everyone whom a metric is defined for: it says nothing then.
+    low, high = np.nanpercentile(means[1:, defined], _INTERVAL, axis=0)
+    found = {
+        columns[index]: Estimate(
+            _rounded(means[0, index]), _rounded(low[n]), _rounded(high[n]), int(count[index])
+        )
+        for n, index in enumerate(defined.tolist())
+    }
+    metrics = {c.metric: estimate for c, estimate in found.items() if c.step is None}
+    steps: dict[str, list[Estimate | None]] = {}
+    for column in columns:
+        if column.step is not None and column.metric in metrics:
+            steps.setdefault(column.metric, []).append(found.get(column))
+    return Scores(metrics, {metric: tuple(each) for metric, each in steps.items()})
+
+
+def _rounded(value: float) -> float:
+    """Six significant digits: what is beyond them is noise, and makes files long."""
+    return float(f"{value:.6g}")
