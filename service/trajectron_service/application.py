@@ -6,15 +6,13 @@ Everything raised here is a ``ServiceError``. Deadlines are seconds on ``time.mo
 from __future__ import annotations
 
 import asyncio
-import base64
-import binascii
 import time
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 
 from trajectron_service import choices as chosen
-from trajectron_service import logs
+from trajectron_service import logs, pages
 from trajectron_service.batching import Batcher, BatchReport
 from trajectron_service.choices import Choices
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
@@ -40,6 +38,7 @@ from trajectron_service.stores import SessionKey, SessionStore
 from trajectron_service.stores.memory import MemoryStore
 from trajectron_service.streams import Stream, StreamLimits
 from trajectron_service.timebase import Timeline
+from trajectron_service.work import WorkInHand
 
 __all__ = ["Application", "Stream"]
 
@@ -47,8 +46,6 @@ log = logs.get(__name__)
 
 # The only tenant until there are tokens.
 TENANT = "default"
-DEFAULT_PAGE = 100
-LARGEST_PAGE = 1000
 HOUSEKEEPING_S = 1.0
 
 
@@ -65,6 +62,7 @@ class Application:
         settings: limits and defaults.
         engine: the loaded models.
         metrics: told about everything.
+        work: counts the calls, and refuses them while the service drains; its own when None.
         store: where sessions are kept; this process's memory when None.
         clock: Unix seconds that never go back: when sessions expire.
         draw_seed: gives the seed of a request that brings none.
@@ -76,6 +74,7 @@ class Application:
         engine: SceneEngine,
         metrics: Metrics,
         *,
+        work: WorkInHand | None = None,
         store: SessionStore | None = None,
         clock: Callable[[], float] | None = None,
         draw_seed: Callable[[], int] = chosen.draw_seed,
@@ -83,6 +82,7 @@ class Application:
         self._settings = settings
         self._engine = engine
         self._metrics = metrics
+        self._work = work or WorkInHand(metrics)
         self._clock = clock or steady_unix_clock()
         self._choices = Choices(settings, engine.models, engine.default_model, draw_seed)
         self._batcher = Batcher[SceneJob, SceneResult](
@@ -104,16 +104,12 @@ class Application:
             weakref.WeakValueDictionary()
         )
         self._started = False
-        self._draining = False
-        self._in_hand = 0
-        self._idle = asyncio.Event()
-        self._idle.set()
         self._housekeeper: asyncio.Task[None] | None = None
         for facts in engine.models.values():
             info = facts.info
             metrics.model_info.labels(info.name, info.hash, str(info.is_default).lower()).set(1)
         metrics.queue_length.set_function(lambda: self._batcher.waiting)
-        metrics.in_hand.set_function(lambda: self._in_hand)
+        metrics.in_hand.set_function(lambda: self._work.count)
         metrics.ready.set_function(lambda: float(self.ready))
 
     async def start(self) -> None:
@@ -126,21 +122,21 @@ class Application:
     @property
     def ready(self) -> bool:
         """Whether new work is taken."""
-        return self._started and not self._draining
+        return self._started and not self._work.draining
 
     def begin_drain(self) -> None:
         """Refuses new work from now on; work in hand finishes, streams end after what they read."""
-        self._draining = True
+        self._work.drain()
         for stream in list(self._streams.values()):
             stream.drain()
 
     async def drained(self) -> None:
         """Returns when no work is in hand."""
-        await self._idle.wait()
+        await self._work.finished()
 
     async def close(self) -> None:
         """Ends the housekeeping and, after what waits there, the inference thread."""
-        self._draining = True
+        self._work.drain()
         if self._housekeeper is not None:
             self._housekeeper.cancel()
             with suppress(asyncio.CancelledError):
@@ -164,7 +160,7 @@ class Application:
         deadline: float | None,
     ) -> Forecast:
         """The futures after ``frames``: what a session that observed them would forecast."""
-        with self._work():
+        with self._work.taken():
             self._check_frames(frames)
             self._choices.check_options(options)
             asked = SessionConfig(
@@ -185,7 +181,7 @@ class Application:
 
     async def create_session(self, session_id: str | None, config: SessionConfig) -> SessionInfo:
         """Opens a session; an id is assigned when None or empty."""
-        with self._work():
+        with self._work.taken():
             key = _key(chosen.session_id(session_id))
             return await self._sessions.create(key, self._blank(config))
 
@@ -197,7 +193,7 @@ class Application:
             after, graph = await self._forecaster.graph(record, key=key, deadline=limit)
             return Change(after), graph
 
-        with self._work():
+        with self._work.taken():
             async with self._until(None) as limit:
                 graph = await self._sessions.change(key, look)
                 return await self._sessions.info(key), graph
@@ -206,16 +202,15 @@ class Application:
         self, page_size: int | None, page_token: str
     ) -> tuple[tuple[SessionInfo, ...], str]:
         """Open sessions in order of id, and the token of the next page, empty on the last."""
-        with self._work():
-            if page_size is not None and not 1 <= page_size <= LARGEST_PAGE:
-                raise invalid("page_size", f"is {page_size}; must be 1 to {LARGEST_PAGE}")
-            after = _read_token(page_token)
-            infos, more = await self._sessions.page(TENANT, after, page_size or DEFAULT_PAGE)
-            return infos, _write_token(infos[-1].id) if more and infos else ""
+        with self._work.taken():
+            size = pages.size(page_size)
+            after = pages.read_token(page_token)
+            infos, more = await self._sessions.page(TENANT, after, size)
+            return infos, pages.write_token(infos[-1].id) if more and infos else ""
 
     async def delete_session(self, session_id: str) -> None:
         """Closes a session and forgets its state."""
-        with self._work():
+        with self._work.taken():
             await self._sessions.delete(_key(session_id))
 
     async def observe(
@@ -223,7 +218,7 @@ class Application:
     ) -> tuple[FrameResult, ...]:
         """Folds frames in order; a refused one leaves the others. A single refused one raises."""
         requests = [FrameRequest(frame) for frame in frames]
-        with self._work():
+        with self._work.taken():
             self._check_frames(frames)
             async with self._until(deadline) as limit:
                 answers = await self._fold(
@@ -243,7 +238,7 @@ class Application:
             )
             return Change(after), forecast
 
-        with self._work():
+        with self._work.taken():
             self._choices.check_options(options)
             async with self._until(deadline) as limit:
                 return await self._sessions.change(key, look)
@@ -252,7 +247,7 @@ class Application:
         self, session_id: str | None, config: SessionConfig, options: StreamOptions
     ) -> Stream:
         """A stream into a session, new or resumed; another stream into it ends."""
-        with self._work():
+        with self._work.taken():
             if options.forecast is not None:
                 self._choices.check_options(options.forecast)
             session, resumed = await self._open(session_id, config)
@@ -267,7 +262,7 @@ class Application:
                 options,
                 fold=lambda requests, deadline: self._fold(key, requests, deadline),
                 on_end=lambda: self._sessions.delete(key, "stream_ended"),
-                busy=self._work,
+                busy=self._work.taken,
                 limits=StreamLimits(
                     self._settings.stream_window,
                     self._settings.max_batch_points,
@@ -335,29 +330,6 @@ class Application:
         if len(frames) > most:
             raise invalid("frames", f"has {len(frames)} frames; a request may have at most {most}")
 
-    @contextmanager
-    def _work(self) -> Iterator[None]:
-        """Counts what is done inside as work in hand; refuses it while draining."""
-        if self._draining:
-            error = ServiceError(
-                ErrorKind.DRAINING,
-                "the service is stopping; another replica may answer",
-                retry_after_s=1.0,
-            )
-            self._metrics.refusals.labels(error.kind.value).inc()
-            raise error
-        self._in_hand += 1
-        self._idle.clear()
-        try:
-            yield
-        except ServiceError as error:
-            self._metrics.refusals.labels(error.kind.value).inc()
-            raise
-        finally:
-            self._in_hand -= 1
-            if not self._in_hand:
-                self._idle.set()
-
     @asynccontextmanager
     async def _until(self, deadline: float | None) -> AsyncIterator[float]:
         """The deadline in force; what is inside ends then, with DEADLINE_EXCEEDED."""
@@ -403,14 +375,3 @@ def _past(kind: ErrorKind) -> Iterator[None]:
 
 def _key(session_id: str) -> SessionKey:
     return SessionKey(TENANT, session_id)
-
-
-def _write_token(last_id: str) -> str:
-    return base64.urlsafe_b64encode(last_id.encode()).decode()
-
-
-def _read_token(token: str) -> str:
-    try:
-        return base64.b64decode(token.encode("ascii"), altchars=b"-_", validate=True).decode()
-    except (binascii.Error, ValueError) as error:
-        raise invalid("page_token", "is not a token that this service gave out") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -32,15 +32,15 @@ class _Malformed:
 
 
 class GrpcInterceptor(grpc.aio.ServerInterceptor):
-    """Wraps the handlers of one service; those of others (health, reflection) pass as they are.
+    """Wraps the handlers of our services; those of others (health, reflection) pass as they are.
 
     Args:
-        service: the full name of the service, such as ``trajectron.v1.TrajectronService``.
+        services: their full names, such as ``trajectron.v1.TrajectronService``.
         metrics: where durations and stages go.
     """
 
-    def __init__(self, service: str, metrics: Metrics) -> None:
-        self._prefix = f"/{service}/"
+    def __init__(self, services: Sequence[str], metrics: Metrics) -> None:
+        self._services = frozenset(services)
         self._metrics = metrics
 
     async def intercept_service(
@@ -50,20 +50,23 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
     ) -> Handler | None:
         """The handler of a call, wrapped (the hook that gRPC calls)."""
         handler = await continuation(handler_call_details)
-        path = handler_call_details.method
-        if handler is None or not path.startswith(self._prefix):
+        service, _, method = handler_call_details.method.removeprefix("/").partition("/")
+        if handler is None or service not in self._services:
             return handler
-        method = path.removeprefix(self._prefix)
-        wrap = grpc.unary_unary_rpc_method_handler
+        wrap: Any = grpc.unary_unary_rpc_method_handler
         call: Any = self._unary(method, handler.unary_unary)
         if handler.request_streaming:
             wrap = grpc.stream_stream_rpc_method_handler
-            call = self._stream(method, handler.stream_stream)
-        return wrap(
+            call = self._stream(method, handler.stream_stream, _all_checked)
+        elif handler.response_streaming:
+            wrap = grpc.unary_stream_rpc_method_handler
+            call = self._stream(method, handler.unary_stream, _checked)
+        wrapped: Handler = wrap(
             call,
             request_deserializer=self._decoder(handler.request_deserializer),
             response_serializer=self._encoder(handler.response_serializer),
         )
+        return wrapped
 
     def _unary(self, method: str, behaviour: Any) -> Any:
         async def call(request: Any, context: Context) -> Any:
@@ -75,13 +78,13 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
 
         return call
 
-    def _stream(self, method: str, behaviour: Any) -> Any:
-        async def call(requests: AsyncIterator[Any], context: Context) -> AsyncIterator[Any]:
+    def _stream(self, method: str, behaviour: Any, checked: Callable[[Any], Any]) -> Any:
+        async def call(request: Any, context: Context) -> AsyncIterator[Any]:
             with self._measured(method) as record:
                 try:
                     # Closed here, not by the garbage collector: a cancelled stream frees its
                     # session at once.
-                    async with aclosing(behaviour(_all_checked(requests), context)) as answers:
+                    async with aclosing(behaviour(checked(request), context)) as answers:
                         async for answer in answers:
                             yield answer
                 except Exception as error:  # noqa: BLE001  every fault becomes a status

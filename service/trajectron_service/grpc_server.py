@@ -1,4 +1,4 @@
-"""The gRPC server: limits, keepalive, health and reflection around ``GrpcApi``."""
+"""The gRPC server: limits, keepalive, health and reflection around our services."""
 
 from __future__ import annotations
 
@@ -7,15 +7,25 @@ from grpc_health.v1 import health as grpc_health
 from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from trajectron_proto.v1 import trajectron_pb2, trajectron_pb2_grpc
+from trajectron_proto.v1 import (
+    evaluation_pb2,
+    evaluation_pb2_grpc,
+    trajectron_pb2,
+    trajectron_pb2_grpc,
+)
 from trajectron_service.application import Application
+from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.grpc_api import GrpcApi
+from trajectron_service.grpc_evaluations import GrpcEvaluations
 from trajectron_service.grpc_interceptor import GrpcInterceptor
 from trajectron_service.health import Health
 from trajectron_service.metrics import Metrics
 from trajectron_service.settings import Settings
 
-SERVICE = trajectron_pb2.DESCRIPTOR.services_by_name["TrajectronService"].full_name
+SERVICES = (
+    trajectron_pb2.DESCRIPTOR.services_by_name["TrajectronService"].full_name,
+    evaluation_pb2.DESCRIPTOR.services_by_name["EvaluationService"].full_name,
+)
 
 # Clients may ping every 10 s, with some jitter, even while no call is open.
 _SHORTEST_PING_MS = 5_000
@@ -25,22 +35,30 @@ _KEEPALIVE_TIMEOUT_MS = 20_000
 
 
 def grpc_server(
-    application: Application, health: Health, metrics: Metrics, settings: Settings
+    application: Application,
+    evaluations: Evaluations,
+    health: Health,
+    metrics: Metrics,
+    settings: Settings,
 ) -> grpc.aio.Server:
     """Everything that is served over gRPC; not yet bound to a port.
 
     Args:
-        application: the core.
+        application: the core: sessions and forecasts.
+        evaluations: the core: batch evaluations.
         health: what ``grpc.health.v1`` tells.
         metrics: where durations go.
         settings: the limits of messages.
     """
     server = grpc.aio.server(
-        interceptors=[GrpcInterceptor(SERVICE, metrics)], options=_options(settings)
+        interceptors=[GrpcInterceptor(SERVICES, metrics)], options=_options(settings)
     )
     trajectron_pb2_grpc.add_TrajectronServiceServicer_to_server(GrpcApi(application), server)
+    evaluation_pb2_grpc.add_EvaluationServiceServicer_to_server(
+        GrpcEvaluations(evaluations), server
+    )
     health_pb2_grpc.add_HealthServicer_to_server(health.servicer, server)
-    names = (SERVICE, grpc_health.SERVICE_NAME, reflection.SERVICE_NAME)
+    names = (*SERVICES, grpc_health.SERVICE_NAME, reflection.SERVICE_NAME)
     reflection.enable_server_reflection(names, server)
     return server
 

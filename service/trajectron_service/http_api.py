@@ -55,7 +55,7 @@ class HttpApi:
             deadline=None,
         )
         forecast = await while_connected(request, work)
-        return _answer(
+        return respond(
             request,
             lambda: encode.forecast_json(forecast),
             lambda: pb.PredictResponse(forecast=protobuf.forecast_message(forecast)),
@@ -65,7 +65,7 @@ class HttpApi:
         """Opens a session: a scene whose graph the service keeps between frames."""
         body = await read_body(request, CreateSessionRequest, self._max_body_bytes)
         session = await self._application.create_session(body.session_id or None, body.to_config())
-        answer = _answer(
+        answer = respond(
             request,
             lambda: encode.session_json(session),
             lambda: pb.CreateSessionResponse(session=protobuf.session_message(session)),
@@ -86,7 +86,7 @@ class HttpApi:
     ) -> Response:
         """Lists open sessions in order of id, a page at a time."""
         sessions, token = await self._application.list_sessions(page_size, page_token)
-        return _answer(
+        return respond(
             request,
             lambda: {
                 "sessions": [encode.session_json(session) for session in sessions],
@@ -101,7 +101,7 @@ class HttpApi:
     async def get_session(self, request: Request, session_id: str) -> Response:
         """A session with its graph: nodes, edges, ages, modulation."""
         session, graph = await self._application.get_session(session_id)
-        return _answer(
+        return respond(
             request,
             lambda: encode.session_json(session) | {"graph": encode.graph_json(graph)},
             lambda: pb.GetSessionResponse(
@@ -124,7 +124,7 @@ class HttpApi:
         body = await read_body(request, ObserveRequest, self._max_body_bytes)
         work = self._application.observe(session_id, body.to_frames(), deadline=None)
         results = await while_connected(request, work)
-        return _answer(
+        return respond(
             request,
             lambda: {"results": [encode.result_json(result) for result in results]},
             lambda: pb.ObserveResponse(
@@ -137,7 +137,7 @@ class HttpApi:
         body = await read_body(request, PredictSessionRequest, self._max_body_bytes)
         work = self._application.predict_session(session_id, body.to_options(), deadline=None)
         forecast = await while_connected(request, work)
-        return _answer(
+        return respond(
             request,
             lambda: encode.forecast_json(forecast),
             lambda: pb.PredictSessionResponse(forecast=protobuf.forecast_message(forecast)),
@@ -146,7 +146,7 @@ class HttpApi:
     async def list_models(self, request: Request) -> Response:
         """The models that this server can run."""
         models = self._application.list_models()
-        return _answer(
+        return respond(
             request,
             lambda: {"models": [encode.model_json(model) for model in models]},
             lambda: pb.ListModelsResponse(
@@ -161,9 +161,10 @@ def json_response(value: dict[str, Any], status: int = 200) -> Response:
     return Response(content, status, media_type="application/json")
 
 
-def _answer(
+def respond(
     request: Request, as_json: Callable[[], dict[str, Any]], as_message: Callable[[], Message]
 ) -> Response:
+    """An answer in the form that the request asks for: JSON, or the contract's message."""
     if PROTOBUF in request.headers.get("accept", ""):
         return Response(as_message().SerializeToString(), media_type=PROTOBUF)
     return json_response(as_json())

@@ -28,18 +28,22 @@ async def read_body(request: Request, shape: type[B], limit_bytes: int) -> B:
         ServiceError: ``TOO_LARGE`` for more than ``limit_bytes``, of which no more are kept;
             ``MALFORMED`` for what is no JSON; ``INVALID_ARGUMENT`` naming the fields.
     """
-    raw = await _read(request, limit_bytes)
+    raw = await read_raw(request, limit_bytes)
+    return parse_body(raw, shape)
+
+
+def parse_body(raw: bytes, shape: type[B]) -> B:
+    """JSON in its shape; raises as ``read_body`` does."""
     try:
         return shape.model_validate_json(raw or b"{}")
     except ValidationError as error:
         raise invalid_body(error) from None
 
 
-async def _read(request: Request, limit_bytes: int) -> bytes:
+async def read_raw(request: Request, limit_bytes: int) -> bytes:
+    """A request's body as it is; raises as ``read_body`` does."""
     if request.headers.get("content-encoding", "identity") != "identity":
-        raise ServiceError(
-            ErrorKind.MALFORMED, "the body has a Content-Encoding; send it as plain JSON"
-        )
+        raise ServiceError(ErrorKind.MALFORMED, "the body has a Content-Encoding; send it as it is")
     announced = request.headers.get("content-length", "0")
     size = int(announced) if announced.isdecimal() else 0
     waits = request.headers.get("expect", "").lower() == "100-continue"
@@ -92,7 +96,7 @@ async def _hang_up(request: Request) -> None:
 def _too_large(limit_bytes: int) -> ServiceError:
     return ServiceError(
         ErrorKind.TOO_LARGE,
-        f"the body is larger than {limit_bytes} bytes; send fewer frames or agents at a time",
+        f"the body is larger than {limit_bytes} bytes; send less at a time",
     )
 
 

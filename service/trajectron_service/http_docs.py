@@ -19,7 +19,9 @@ from starlette.responses import RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
+from trajectron_service.http_api import PROTOBUF
 from trajectron_service.http_errors import PROBLEM_JSON, Problem, problem_of
+from trajectron_service.http_evaluation_schemas import CreateEvaluationRequest
 from trajectron_service.http_schemas import (
     CreateSessionRequest,
     ObserveRequest,
@@ -35,6 +37,7 @@ _BODIES: tuple[type[BaseModel], ...] = (
     CreateSessionRequest,
     ObserveRequest,
     PredictSessionRequest,
+    CreateEvaluationRequest,
     Problem,
 )
 _RETRY_AFTER = {
@@ -45,9 +48,10 @@ _RETRY_AFTER = {
 }
 _ERRORS: dict[int, str] = {
     400: "The body is not valid JSON.",
-    404: "No such session, model or agent, as `reason` says.",
-    409: "The session's state forbids it: `reason` is SESSION_EXISTS, FRAME_CONFLICT, "
-    "FRAME_OUT_OF_ORDER or NO_FRAMES.",
+    404: "No such session, evaluation, model or agent, as `reason` says.",
+    409: "The state of the session or evaluation forbids it: `reason` is SESSION_EXISTS, "
+    "FRAME_CONFLICT, FRAME_OUT_OF_ORDER, NO_FRAMES, EVALUATION_EXISTS, EVALUATION_HAS_NO_RESULT "
+    "or DATASET_UNAVAILABLE.",
     413: "The body is too large.",
     422: "A field is missing, mistyped, unknown or out of range: `violations` names it.",
     429: "The queue or the service is full; try again later.",
@@ -66,7 +70,7 @@ _EXAMPLES: tuple[ServiceError, ...] = (
     ServiceError(ErrorKind.SESSION_EXISTS, 'session_id: "crossing-4" is open already'),
     ServiceError(
         ErrorKind.TOO_LARGE,
-        "the body is larger than 16777216 bytes; send fewer frames or agents at a time",
+        "the body is larger than 16777216 bytes; send less at a time",
     ),
     invalid("num_samples", "is 0; must be 1 to 2000"),
     ServiceError(
@@ -85,6 +89,10 @@ is re-centred. **Forecasts** carry absolute positions here; with `Accept: applic
 the answer is the message of the gRPC API (`trajectron.v1`), whose arrays are offsets from each
 agent's last position. **Errors** are RFC 9457 problems (`application/problem+json`).
 """
+
+
+BINARY: dict[str, Any] = {"content": {PROTOBUF: {"schema": {"type": "string", "format": "binary"}}}}
+"""An answer that can be had as the contract's message as well."""
 
 
 def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -75,8 +75,8 @@ def session_json(session: SessionInfo) -> dict[str, Any]:
         "type_map": dict(config.type_map),
         "dt_s": session.dt_s,
         "version": session.version,
-        "create_time": _rfc3339(session.created_at),
-        "expire_time": _rfc3339(session.expires_at),
+        "create_time": rfc3339(session.created_at),
+        "expire_time": rfc3339(session.expires_at),
         "last_frame_time": session.last_frame_time,
         "agent_count": session.agent_count,
         "last_sequence": session.last_sequence,
@@ -138,5 +138,6 @@ def model_json(model: ModelInfo) -> dict[str, Any]:
     }
 
 
-def _rfc3339(unix_s: float) -> str:
+def rfc3339(unix_s: float) -> str:
+    """An instant for JSON."""
     return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, FastAPI
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
@@ -13,9 +11,12 @@ from trajectron_service import http_answers as answers
 from trajectron_service import http_errors
 from trajectron_service.application import Application
 from trajectron_service.errors import ServiceError
+from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.health import Health, Phase
-from trajectron_service.http_api import PROTOBUF, HttpApi, json_response
-from trajectron_service.http_docs import add_docs, errors, takes
+from trajectron_service.http_api import HttpApi, json_response
+from trajectron_service.http_docs import BINARY, add_docs, errors, takes
+from trajectron_service.http_evaluation_routes import evaluation_routes
+from trajectron_service.http_evaluations import HttpEvaluations
 from trajectron_service.http_middleware import RequestMiddleware
 from trajectron_service.http_schemas import (
     CreateSessionRequest,
@@ -25,18 +26,21 @@ from trajectron_service.http_schemas import (
 )
 from trajectron_service.metrics import CONTENT_TYPE, Metrics
 
-_BINARY: dict[str, Any] = {
-    "content": {PROTOBUF: {"schema": {"type": "string", "format": "binary"}}}
-}
-
 
 def http_app(
-    application: Application, health: Health, metrics: Metrics, *, max_body_bytes: int, version: str
+    application: Application,
+    evaluations: Evaluations,
+    health: Health,
+    metrics: Metrics,
+    *,
+    max_body_bytes: int,
+    version: str,
 ) -> FastAPI:
     """Everything that is served over HTTP.
 
     Args:
-        application: the core.
+        application: the core: sessions and forecasts.
+        evaluations: the core: batch evaluations.
         health: what ``/readyz`` tells.
         metrics: what ``/metrics`` tells.
         max_body_bytes: larger bodies are refused while they are read.
@@ -50,6 +54,7 @@ def http_app(
     api = HttpApi(application, max_body_bytes)
     app.include_router(_predictions(api))
     app.include_router(_sessions(api))
+    app.include_router(evaluation_routes(HttpEvaluations(evaluations, max_body_bytes)))
     app.include_router(_operations(health, metrics))
     add_docs(app, version)
     return app
@@ -65,7 +70,7 @@ def _predictions(api: HttpApi) -> APIRouter:
             summary="Predict" + (" (short path)" if path == "/predict" else ""),
             operation_id="predict" + ("_short" if path == "/predict" else ""),
             response_model=answers.Forecast,
-            responses={200: _BINARY, **errors(400, 404, 413, 422, 429, 503, 504)},
+            responses={200: BINARY, **errors(400, 404, 413, 422, 429, 503, 504)},
             openapi_extra=takes(PredictRequest),
         )
     router.add_api_route(
@@ -75,7 +80,7 @@ def _predictions(api: HttpApi) -> APIRouter:
         summary="List models",
         operation_id="list_models",
         response_model=answers.Models,
-        responses={200: _BINARY, **errors()},
+        responses={200: BINARY, **errors()},
     )
     return router
 
@@ -90,7 +95,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Create a session",
         operation_id="create_session",
         response_model=answers.Session,
-        responses={201: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503)},
+        responses={201: BINARY, **errors(400, 404, 409, 413, 422, 429, 503)},
         openapi_extra=takes(CreateSessionRequest, required=False),
     )
     router.add_api_route(
@@ -100,7 +105,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="List sessions",
         operation_id="list_sessions",
         response_model=answers.Sessions,
-        responses={200: _BINARY, **errors(422)},
+        responses={200: BINARY, **errors(422)},
     )
     router.add_api_route(
         "/v1/sessions/{session_id}:observe",
@@ -109,7 +114,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Observe frames",
         operation_id="observe",
         response_model=answers.FrameResults,
-        responses={200: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        responses={200: BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
         openapi_extra=takes(ObserveRequest),
     )
     router.add_api_route(
@@ -119,7 +124,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Predict from a session",
         operation_id="predict_session",
         response_model=answers.Forecast,
-        responses={200: _BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        responses={200: BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
         openapi_extra=takes(PredictSessionRequest, required=False),
     )
     router.add_api_route(
@@ -129,7 +134,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Get a session and its graph",
         operation_id="get_session",
         response_model=answers.SessionWithGraph,
-        responses={200: _BINARY, **errors(404, 422)},
+        responses={200: BINARY, **errors(404, 422)},
     )
     router.add_api_route(
         "/v1/sessions/{session_id}",

@@ -18,12 +18,14 @@ from importlib import metadata
 
 from trajectron_service import engine, logs
 from trajectron_service.application import Application
-from trajectron_service.grpc_server import SERVICE, grpc_server
+from trajectron_service.evaluations.jobs import Evaluations
+from trajectron_service.grpc_server import SERVICES, grpc_server
 from trajectron_service.health import Health
 from trajectron_service.http_routes import http_app
 from trajectron_service.http_server import HttpServer, listen
 from trajectron_service.metrics import Metrics
 from trajectron_service.settings import Settings, SettingsError
+from trajectron_service.work import WorkInHand
 
 DISTRIBUTION = "trajectron-service"
 
@@ -42,6 +44,7 @@ class Service:
     """A running service: what it is made of, and the ports that it got."""
 
     application: Application
+    evaluations: Evaluations
     health: Health
     metrics: Metrics
     http_port: int
@@ -89,7 +92,7 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
     """
     metrics = Metrics()
     metrics.build(version())
-    health = Health(SERVICE)
+    health = Health(*SERVICES)
     await health.starting()
     async with AsyncExitStack() as stack:
         with _port("http_port", settings.host, settings.http_port):
@@ -97,9 +100,12 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         loaded = engine.load(
             settings, lambda stage, seconds: metrics.stage_seconds.labels(stage).observe(seconds)
         )
-        application = Application(settings, loaded, metrics)
+        work = WorkInHand(metrics)
+        application = Application(settings, loaded, metrics, work=work)
         stack.push_async_callback(_close, application)
-        calls = grpc_server(application, health, metrics, settings)
+        evaluations = Evaluations(settings, metrics, work)
+        stack.push_async_callback(evaluations.close)
+        calls = grpc_server(application, evaluations, health, metrics, settings)
         with _port("grpc_port", settings.host, settings.grpc_port):
             # gRPC itself would not say why it cannot bind, but log on its own.
             listen(settings.host, settings.grpc_port).close()
@@ -107,6 +113,7 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         pages = HttpServer(
             http_app(
                 application,
+                evaluations,
                 health,
                 metrics,
                 max_body_bytes=settings.max_message_bytes,
@@ -118,16 +125,24 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         stack.push_async_callback(calls.stop, _LAST_BYTES_S)
         await pages.start()
         stack.push_async_callback(pages.stop)
-        stack.push_async_callback(_drain, application, health, settings.drain_grace_s)
+        stack.push_async_callback(_drain, application, evaluations, health, settings.drain_grace_s)
         await application.start()
+        await evaluations.start()
         await health.ready()
-        yield Service(application, health, metrics, listener.getsockname()[1], grpc_port)
+        http_port = listener.getsockname()[1]
+        yield Service(application, evaluations, health, metrics, http_port, grpc_port)
 
 
-async def _drain(application: Application, health: Health, grace_s: float) -> None:
-    """Health turns and new work is refused at once; work in hand has ``grace_s`` to finish."""
+async def _drain(
+    application: Application, evaluations: Evaluations, health: Health, grace_s: float
+) -> None:
+    """Health turns and new work is refused at once; work in hand has ``grace_s`` to finish.
+
+    An evaluation is no work in hand: it is ended later, and taken up at the next start.
+    """
     await health.draining()
     application.begin_drain()
+    evaluations.begin_drain()
     try:
         async with asyncio.timeout(grace_s):
             await application.drained()

@@ -23,6 +23,8 @@ from prometheus_client import (
 SECONDS = (
     0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4,
 )  # fmt: skip
+# From a second to a day.
+LONG_SECONDS = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
 SIZES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 AGENTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 CONTENT_TYPE = "text/plain; version=1.0.0; charset=utf-8"
@@ -113,6 +115,19 @@ class Metrics:
             "trajectron_work_in_hand", "Calls and streams being worked on.", registry=registry
         )
         self.ready = Gauge("trajectron_ready", "1 while new work is taken.", registry=registry)
+        self.evaluations = Gauge(
+            "trajectron_evaluations",
+            "Batch evaluations kept, by state (queued, running, succeeded, failed, cancelled).",
+            ("state",),
+            registry=registry,
+        )
+        self.evaluation_seconds = Histogram(
+            "trajectron_evaluation_duration_seconds",
+            "Time from the start of a batch evaluation to its end, by the state it ended in.",
+            ("state",),
+            buckets=LONG_SECONDS,
+            registry=registry,
+        )
         self.model_info = Gauge(
             "trajectron_model_info",
             "A loaded model.",

@@ -90,6 +90,26 @@ class Settings(BaseSettings):
     )
     drain_grace_s: Seconds = Field(20.0, description="Time for work in hand after SIGTERM.")
 
+    data: Path | None = Field(
+        None,
+        description="Folder of the ETH/UCY recordings with their `splits.json`, or its parent; "
+        "evaluations of `eth_ucy` need it.",
+    )
+    state_dir: Path | None = Field(
+        None,
+        description="Folder of what outlives the process: evaluations with their results. Unset: "
+        "a temporary one, gone at the end.",
+    )
+    max_evaluations: Count = Field(1000, description="Evaluations kept; more are refused.")
+    evaluation_queue_size: Count = Field(16, description="Evaluations that wait for their turn.")
+    evaluations_at_once: Count = Field(1, description="Evaluations that run at the same time.")
+    evaluation_threads: Count = Field(1, description="Threads of one evaluation.")
+    evaluation_priority: Literal["idle", "low", "normal"] = Field(
+        "idle",
+        description="Of evaluations beside forecasts. `idle`: they run where nothing else wants "
+        "to; `low`: at the lowest nice value.",
+    )
+
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Level.")
     log_format: Literal["console", "json"] = Field("console", description="Form of log lines.")
 

@@ -83,7 +83,7 @@ async def jobs_waiting(service: Service, number: int) -> None:
 async def calls_in_hand(service: Service, number: int) -> None:
     """Returns once the application works on that many calls."""
     async with asyncio.timeout(30):
-        while service.application._in_hand != number:  # noqa: ASYNC110  a count has no event
+        while service.application._work.count != number:  # noqa: ASYNC110  a count has no event
             await asyncio.sleep(0.001)
 
 

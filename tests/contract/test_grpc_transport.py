@@ -193,6 +193,7 @@ async def test_reflection_tells_the_services_and_their_files(channel: grpc.aio.C
     names = {one.name for one in (await call.read()).list_services_response.service}
     assert names == {
         SERVICE,
+        "trajectron.v1.EvaluationService",
         "grpc.health.v1.Health",
         "grpc.reflection.v1alpha.ServerReflection",
     }

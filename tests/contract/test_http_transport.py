@@ -364,6 +364,11 @@ async def test_the_documentation_describes_everything(http: httpx.AsyncClient) -
     assert openapi["paths"].keys() == {
         "/predict", "/v1/predict", "/v1/models", "/v1/sessions", "/v1/sessions/{session_id}",
         "/v1/sessions/{session_id}:observe", "/v1/sessions/{session_id}:predict",
+        "/v1/evaluations", "/v1/evaluations/{evaluation_id}",
+        "/v1/evaluations/{evaluation_id}:watch", "/v1/evaluations/{evaluation_id}:cancel",
+        "/v1/evaluations/{evaluation_id}/result.json",
+        "/v1/evaluations/{evaluation_id}/result.csv",
+        "/v1/evaluations/{evaluation_id}/report.html",
         "/healthz", "/readyz", "/metrics",
     }  # fmt: skip
     schemas = openapi["components"]["schemas"]
