@@ -12,7 +12,8 @@ Three forms (paper, section 5, and its note on analytic mixtures):
 An agent that has shown no direction gets an isotropic forecast: each of its samples is
 turned by a uniform angle of its own, and its modes are the moments of that.
 
-Samples of different agents are independent given the histories.
+Samples of different agents are independent given the histories. Those of one agent are
+independent or stratified, as asked; each alone has the same distribution (``noise``).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from trajectron_model.encoders import EncoderState
 from trajectron_model.features import Kinematics, from_frame, to_frame
 from trajectron_model.gmm import choose
 from trajectron_model.integration import RandomWalk, integrate
-from trajectron_model.noise import agent_noise
+from trajectron_model.noise import SAMPLINGS, Sampling, agent_noise
 from trajectron_model.state import SceneState, stack
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class ForecastRequest:
         step: of the session, its count of accepted frames: part of the key of the noise.
         agents: ids wanted, in this order; None for all that can move.
         include_modes: whether means and covariances are given; ``gmm`` always gives them.
+        sampling: how one agent's samples go together; see ``noise``.
 
     Raises:
         ValueError: a number out of its bounds.
@@ -69,10 +71,13 @@ class ForecastRequest:
     step: int = 0
     agents: tuple[str, ...] | None = None
     include_modes: bool = False
+    sampling: Sampling = "iid"
 
     def __post_init__(self) -> None:
         if self.mode not in ("full", "z_best", "gmm"):
             raise ValueError(f"mode {self.mode!r} is none of full, z_best, gmm")
+        if self.sampling not in SAMPLINGS:
+            raise ValueError(f"sampling {self.sampling!r} is none of {', '.join(SAMPLINGS)}")
         if not 1 <= self.num_samples <= MAX_SAMPLES:
             raise ValueError(f"num_samples must be 1 to {MAX_SAMPLES}")
         if not 1 <= self.horizon <= MAX_HORIZON:
@@ -315,7 +320,14 @@ def _fill_samples(
     for i in wanted:
         request = requests[agents.keys[i][0]]
         noise.append(
-            agent_noise(request.seed, agents.ids[i], request.step, request.samples, horizon)
+            agent_noise(
+                request.seed,
+                agents.ids[i],
+                request.step,
+                request.samples,
+                horizon,
+                request.sampling,
+            )
         )
     counts = [n.latent.size for n in noise]
     latent, turn, component, normal = (

@@ -3,16 +3,39 @@
 The same request gives an agent the same samples whatever else is in the scene or batch,
 in whatever order agents stand, on whichever machine. Asking for another number of samples
 or steps is another request: fewer samples are not the first of more.
+
+An agent's samples go together in one of two ways. Each sample alone has exactly the same
+distribution in both, so estimates from samples are unbiased in both; agents are independent.
+
+* ``iid``: independent of each other.
+* ``stratified``: spread evenly over the distribution, so that a few samples cover more of it.
+  Latent values come by systematic sampling: S points 1/S apart, shifted at random, so that each
+  is drawn as often as its probability says, to within one sample. Every other number is a Latin
+  hypercube (McKay et al. 1979): one sample in each S-th of its range. The two numbers that move
+  the end of a path the most are spread evenly together, and under each latent value: their
+  S-ths are taken in the order of a Kronecker sequence (Richtmyer 1951).
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import struct
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
+
+Sampling = Literal["iid", "stratified"]
+SAMPLINGS: tuple[str, ...] = get_args(Sampling)
+
+Float64 = NDArray[np.float64]
+
+_KRONECKER = np.sqrt([2.0, 3.0])
+_TINY = np.finfo(np.float64).tiny
+_BELOW_ONE = 1.0 - np.finfo(np.float64).epsneg
+_BELOW_ONE_FLOAT32 = np.float32(1.0) - np.finfo(np.float32).epsneg
 
 
 class AgentNoise(NamedTuple):
@@ -24,7 +47,9 @@ class AgentNoise(NamedTuple):
     normal: NDArray[np.float32]  # [S, H, 2] standard normal
 
 
-def agent_noise(seed: int, agent_id: str, step: int, samples: int, horizon: int) -> AgentNoise:
+def agent_noise(
+    seed: int, agent_id: str, step: int, samples: int, horizon: int, sampling: Sampling = "iid"
+) -> AgentNoise:
     """Draws an agent's noise.
 
     Args:
@@ -33,12 +58,69 @@ def agent_noise(seed: int, agent_id: str, step: int, samples: int, horizon: int)
         step: of the session: its count of accepted frames.
         samples: S.
         horizon: H.
+        sampling: how the samples go together; see the module.
     """
     digest = hashlib.blake2b(
         struct.pack("<QQ", seed, step) + agent_id.encode("utf-8", "surrogatepass"), digest_size=16
     ).digest()
     key = np.frombuffer(digest, dtype=np.uint64)
     generator = np.random.Generator(np.random.Philox(key=key))
+    if sampling == "stratified":
+        return _stratified(generator, samples, horizon)
     uniform = generator.random((samples, 2 + horizon), dtype=np.float32)
     normal = generator.standard_normal((samples, horizon, 2), dtype=np.float32)
     return AgentNoise(uniform[:, 0], uniform[:, 1], uniform[:, 2:], normal)
+
+
+def _stratified(generator: np.random.Generator, samples: int, horizon: int) -> AgentNoise:
+    """Numbers are rows and samples columns until they are handed back."""
+    others = 1 + horizon + 2 * (horizon - 1)  # turn, components, normals but the leading two
+    order = np.argsort(generator.random((1 + others, samples)), axis=1)
+    point = order[0]  # [S] a sample's place along the sequence
+    latent = (point + generator.random()) / samples
+    leading = (_sequence(samples)[:, point] + generator.integers(samples, size=(2, 1))) % samples
+    strata = np.concatenate([order[1 : 2 + horizon], leading, order[2 + horizon :]])
+    uniform = (strata + generator.random(strata.shape)) / samples  # [1 + 3 H, S]
+    normal = ndtri(uniform[1 + horizon :].clip(_TINY, _BELOW_ONE)).reshape(horizon, 2 * samples)
+    return AgentNoise(
+        _below_one(latent),
+        _below_one(uniform[0]),
+        _below_one(uniform[1 : 1 + horizon].T),
+        _leading_first(normal)
+        .reshape(horizon, 2, samples)
+        .transpose(2, 0, 1)
+        .astype(np.float32),  # [S, H, 2]
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _sequence(samples: int) -> NDArray[np.int64]:
+    """[2, S] the S-ths of two numbers' ranges in which points of a Kronecker sequence lie.
+
+    Their ranks, so that each S-th is taken once: for small S the sequence itself comes back
+    too near to where it was.
+    """
+    points = np.outer(_KRONECKER, np.arange(samples)) % 1.0
+    ranks = points.argsort(axis=1).argsort(axis=1)
+    ranks.flags.writeable = False
+    return ranks
+
+
+def _leading_first(normal: Float64) -> Float64:
+    """Turns standard normals [H, ...] so that the first moves the end of a path the most.
+
+    Step t's change of velocity counts in the H - t + 1 positions from t on. The normals are
+    reflected (Householder 1958) so that their sum with these weights is the first number alone;
+    a reflection leaves them independent and standard.
+    """
+    weights = np.arange(len(normal), 0.0, -1.0)
+    mirror = weights / np.linalg.norm(weights)
+    mirror[0] -= 1.0
+    scale = 2.0 / max(float(mirror @ mirror), float(_TINY))  # H = 1: nothing to reflect
+    reflected: Float64 = normal - np.outer(scale * mirror, mirror @ normal)
+    return reflected
+
+
+def _below_one(uniform: Float64) -> NDArray[np.float32]:
+    """As float32, which would round the largest values up to one."""
+    return np.minimum(uniform.astype(np.float32), _BELOW_ONE_FLOAT32)

@@ -149,6 +149,7 @@ class Choices:
             include_modes=(
                 mode is ForecastMode.GMM if options.include_modes is None else options.include_modes
             ),
+            sampling=options.sampling,
         )
         self._check_size(task, model)
         return task

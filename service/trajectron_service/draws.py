@@ -49,6 +49,7 @@ class _Draw:
             step=task.step,
             agents=self.agents,
             include_modes=task.include_modes,
+            sampling=task.sampling.value,
         )
 
 

@@ -25,6 +25,7 @@ from trajectron_service.messages import (
     GraphEdge,
     GraphNode,
     ModelInfo,
+    Sampling,
     SceneGraph,
 )
 from trajectron_service.metrics import Stage
@@ -110,8 +111,9 @@ class Engine:
                 timeline = taken.timeline
                 steps.extend(taken.steps)
             tasks = tuple(
-                ForecastTask(head(timeline), mode, 20, facts.info.horizon, 0, 0, None, False)
+                ForecastTask(head(timeline), mode, 20, facts.info.horizon, 0, 0, None, False, how)
                 for mode in ForecastMode
+                for how in Sampling
             )
             self.run([SceneJob(name, (), (), tuple(steps), (), tasks)])
 

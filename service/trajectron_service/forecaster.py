@@ -284,6 +284,7 @@ class Forecaster:
             # Rounded: 3 * 0.4 is to read 1.2.
             time_offsets_s=tuple(round(facts.info.dt_s * (h + 1), 9) for h in range(task.horizon)),
             agents=agents,
+            sampling=task.sampling,
         )
 
 

@@ -27,6 +27,11 @@ _MODES = {
     pb.FORECAST_MODE_Z_BEST: core.ForecastMode.Z_BEST,
     pb.FORECAST_MODE_GMM: core.ForecastMode.GMM,
 }
+_SAMPLINGS = {
+    pb.SAMPLING_UNSPECIFIED: core.Sampling.IID,
+    pb.SAMPLING_IID: core.Sampling.IID,
+    pb.SAMPLING_STRATIFIED: core.Sampling.STRATIFIED,
+}
 _UNKNOWN_TYPES = {
     pb.UNKNOWN_TYPE_POLICY_UNSPECIFIED: core.UnknownTypes.REJECT,
     pb.UNKNOWN_TYPE_POLICY_REJECT: core.UnknownTypes.REJECT,
@@ -50,6 +55,10 @@ _MODES_OUT = {
     core.ForecastMode.FULL: pb.FORECAST_MODE_FULL,
     core.ForecastMode.Z_BEST: pb.FORECAST_MODE_Z_BEST,
     core.ForecastMode.GMM: pb.FORECAST_MODE_GMM,
+}
+_SEMANTICS_OUT = {
+    core.Sampling.IID: pb.SAMPLE_SEMANTICS_INDEPENDENT_AGENTS,
+    core.Sampling.STRATIFIED: pb.SAMPLE_SEMANTICS_INDEPENDENT_AGENTS_STRATIFIED,
 }
 _UNKNOWN_TYPES_OUT = {
     core.UnknownTypes.REJECT: pb.UNKNOWN_TYPE_POLICY_REJECT,
@@ -84,7 +93,7 @@ def _agent(message: pb.Agent) -> core.Agent:
 
 
 def forecast_options(message: pb.ForecastOptions, path: str = "options") -> core.ForecastOptions:
-    """What to forecast; raises ``INVALID_ARGUMENT`` for a mode that does not exist."""
+    """What to forecast; raises ``INVALID_ARGUMENT`` for an enum value that does not exist."""
     return core.ForecastOptions(
         mode=_known(_MODES, message.mode, f"{path}.mode", "a ForecastMode"),
         num_samples=message.num_samples if message.HasField("num_samples") else None,
@@ -92,6 +101,7 @@ def forecast_options(message: pb.ForecastOptions, path: str = "options") -> core
         seed=message.seed if message.HasField("seed") else None,
         agents=tuple(message.agent_ids) or None,
         include_modes=message.include_modes if message.HasField("include_modes") else None,
+        sampling=_known(_SAMPLINGS, message.sampling, f"{path}.sampling", "a Sampling"),
     )
 
 
@@ -224,7 +234,7 @@ def forecast_message(forecast: core.Forecast) -> pb.Forecast:
         seed=forecast.seed,
         reference_time_s=forecast.reference_time,
         time_offsets_s=forecast.time_offsets_s,
-        sample_semantics=pb.SAMPLE_SEMANTICS_INDEPENDENT_AGENTS,
+        sample_semantics=_SEMANTICS_OUT[forecast.sampling],
         agents=[_agent_forecast(agent) for agent in forecast.agents],
     )
 

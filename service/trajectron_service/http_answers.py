@@ -64,8 +64,9 @@ class Forecast(Answer):
         description="[H] seconds after `reference_time` of every step, the first above zero."
     )
     sample_semantics: str = Field(
-        description="`independent_agents`: samples of different agents are independent of each "
-        "other given the histories."
+        description="Samples of different agents are independent of each other given the "
+        "histories. Those of one agent: `independent_agents`: independent too; "
+        "`independent_agents_stratified`: spread evenly, each with the same distribution."
     )
     agents: list[AgentForecast] = Field(description="In the order asked for.")
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 from trajectron_service import messages as core
-from trajectron_service.messages import ForecastMode, UnknownTypes
+from trajectron_service.messages import ForecastMode, Sampling, UnknownTypes
 
 _EXAMPLE_FRAMES: list[dict[str, Any]] = [
     {"time": 0.0, "agents": [{"id": "7", "type": "pedestrian", "x": 8.46, "y": 3.59}]},
@@ -102,6 +102,13 @@ class ForecastOptions(Body):
         description="Whether mean and covariance of every mode are returned; default: only for "
         "`gmm`. Mode probabilities are always returned.",
     )
+    sampling: Sampling = Field(
+        Sampling.IID,
+        description="How one agent's samples go together; each alone has the same distribution. "
+        "`iid`: independent. `stratified`: spread evenly over the distribution (latent values in "
+        "their probabilities' shares, quasi-random noise), so that a few cover more of it. Agents "
+        "are independent of each other either way.",
+    )
 
     def to_options(self) -> core.ForecastOptions:
         """The options as the core takes them."""
@@ -112,6 +119,7 @@ class ForecastOptions(Body):
             seed=self.seed,
             agents=self.agents or None,
             include_modes=self.include_modes,
+            sampling=self.sampling,
         )
 
 

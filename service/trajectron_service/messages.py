@@ -26,6 +26,13 @@ class ForecastMode(enum.Enum):
     GMM = "gmm"
 
 
+class Sampling(enum.Enum):
+    """How the samples of one agent go together; each alone has the same distribution."""
+
+    IID = "iid"
+    STRATIFIED = "stratified"
+
+
 class UnknownTypes(enum.Enum):
     """What happens to an agent whose type the model does not know."""
 
@@ -86,6 +93,7 @@ class ForecastOptions:
     seed: int | None = None
     agents: tuple[str, ...] | None = None
     include_modes: bool | None = None
+    sampling: Sampling = Sampling.IID
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +195,7 @@ class AgentForecast:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """A scene's futures from ``reference_time`` on; samples are independent between agents."""
+    """A scene's futures from ``reference_time`` on; see ``sample_semantics``."""
 
     model: str
     model_hash: str
@@ -196,7 +204,13 @@ class Forecast:
     reference_time: float
     time_offsets_s: tuple[float, ...]  # [H], the first > 0
     agents: tuple[AgentForecast, ...]
-    sample_semantics: str = "independent_agents"
+    sampling: Sampling = Sampling.IID
+
+    @property
+    def sample_semantics(self) -> str:
+        """How samples go together: between agents always independent, within one as asked."""
+        stratified = self.sampling is Sampling.STRATIFIED
+        return "independent_agents_stratified" if stratified else "independent_agents"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NewType, Protocol
 
-from trajectron_service.messages import AgentForecast, ForecastMode, ModelInfo, SceneGraph
+from trajectron_service.messages import AgentForecast, ForecastMode, ModelInfo, Sampling, SceneGraph
 from trajectron_service.timebase import Head, Step
 
 State = NewType("State", object)
@@ -41,6 +41,7 @@ class ForecastTask:
     step: int
     agents: tuple[str, ...] | None
     include_modes: bool
+    sampling: Sampling
 
 
 @dataclass(frozen=True, eq=False)

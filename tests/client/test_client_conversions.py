@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from datetime import UTC, datetime
 
@@ -61,6 +62,12 @@ def over_http(value: core.Forecast) -> tc.Forecast:
 
 Carrier = Callable[[core.Forecast], tc.Forecast]
 CARRIERS = pytest.mark.parametrize("carry", [over_grpc, over_http])
+
+
+@CARRIERS
+def test_a_forecast_says_that_its_samples_are_stratified(carry: Carrier) -> None:
+    stratified = dataclasses.replace(forecast(), sampling=core.Sampling.STRATIFIED)
+    assert carry(stratified).sample_semantics == "independent_agents_stratified"
 
 
 @CARRIERS
@@ -171,8 +178,11 @@ def test_the_service_reads_the_same_request_on_both_transports() -> None:
         "seed": 5,
         "agents": ["7"],
         "include_modes": True,
+        "sampling": "stratified",
     }
-    expected = core.ForecastOptions(core.ForecastMode.Z_BEST, 3, 7, 5, ("7",), True)
+    expected = core.ForecastOptions(
+        core.ForecastMode.Z_BEST, 3, 7, 5, ("7",), True, core.Sampling.STRATIFIED
+    )
     operation = operations.predict(
         FRAMES,
         model="zara1",

@@ -39,6 +39,7 @@ EXPORTED = [
     "Outcome",
     "OverloadedError",
     "ResourceExhaustedError",
+    "Sampling",
     "SceneGraph",
     "ServiceError",
     "Session",

@@ -26,7 +26,15 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
-_OPTION_NAMES = ("mode", "num_samples", "horizon", "seed", "agents", "include_modes")
+_OPTION_NAMES = (
+    "mode",
+    "num_samples",
+    "horizon",
+    "seed",
+    "agents",
+    "include_modes",
+    "sampling",
+)
 
 # By kind, written out again here so that a slip in the service's own table shows.
 CODES = {
@@ -269,6 +277,8 @@ def options_message(options: Json) -> pb.ForecastOptions:
     fields["agent_ids"] = fields.pop("agents", None) or ()
     if "mode" in fields:
         fields["mode"] = f"FORECAST_MODE_{fields['mode'].upper()}"
+    if "sampling" in fields:
+        fields["sampling"] = f"SAMPLING_{fields['sampling'].upper()}"
     return pb.ForecastOptions(**fields)
 
 

@@ -46,6 +46,12 @@ async def test_stateless_forecasts_are_the_same(
     assert_same(one, other)
 
 
+async def test_stratified_forecasts_are_the_same(drivers: tuple[Driver, Driver]) -> None:
+    options = {"num_samples": 7, "horizon": 9, "seed": 11, "sampling": "stratified"}
+    one, other = [await driver.predict(walking(6), **options) for driver in drivers]
+    assert_same(one, other)
+
+
 async def test_defaults_are_the_same(drivers: tuple[Driver, Driver]) -> None:
     one, other = [await driver.predict(walking(), seed=1) for driver in drivers]
     assert_same(one, other)

@@ -74,6 +74,38 @@ async def test_z_best_samples_the_most_probable_mode_only(driver: Driver) -> Non
         assert set(shown["sample_modes"]) == {int(shown["mode_probabilities"].argmax())}
 
 
+async def test_stratified_samples_are_as_many_of_each_mode_as_its_probability_says(
+    driver: Driver,
+) -> None:
+    """To within one; 200 independent ones miss that for almost every agent."""
+    forecast = await driver.predict(walking(), num_samples=200, seed=3, sampling="stratified")
+    assert forecast["sample_semantics"] == "independent_agents_stratified"
+    for shown in forecast["agents"]:
+        drawn = np.bincount(shown["sample_modes"], minlength=len(shown["mode_probabilities"]))
+        assert np.abs(drawn - 200 * shown["mode_probabilities"]).max() < 1.0 + 1e-3
+
+
+async def test_independent_samples_are_what_comes_unasked(driver: Driver) -> None:
+    unasked, asked, stratified = [
+        await driver.predict(walking(), num_samples=20, seed=3, **options)
+        for options in ({}, {"sampling": "iid"}, {"sampling": "stratified"})
+    ]
+    assert asked["sample_semantics"] == unasked["sample_semantics"] == "independent_agents"
+    for one, same, other in zip(
+        unasked["agents"], asked["agents"], stratified["agents"], strict=True
+    ):
+        assert (one["samples"] == same["samples"]).all()
+        assert (one["samples"] != other["samples"]).any()
+
+
+async def test_stratified_samples_keep_their_seed_in_any_company(driver: Driver) -> None:
+    options: dict[str, Any] = {"num_samples": 20, "seed": 3, "sampling": "stratified"}
+    everyone = await driver.predict(walking(), **options)
+    last = everyone["agents"][-1]
+    alone = await driver.predict(walking(), agents=[last["id"]], **options)
+    assert alone["agents"][0]["samples"] == pytest.approx(last["samples"], abs=1e-4)
+
+
 async def test_the_same_seed_gives_the_same_samples_and_another_gives_others(
     driver: Driver,
 ) -> None:

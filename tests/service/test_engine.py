@@ -19,7 +19,7 @@ from trajectron_model.state import SceneFrame, SceneState
 from trajectron_model.trajectron import Trajectron
 from trajectron_service import engine as engines
 from trajectron_service.engine import Engine, pack, unpack
-from trajectron_service.messages import AgentForecast, ForecastMode
+from trajectron_service.messages import AgentForecast, ForecastMode, Sampling
 from trajectron_service.scenes import ForecastTask, SceneJob, SceneResult, State
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.timebase import Grid, Observation, Step, Timeline, advance, head
@@ -59,7 +59,7 @@ def job_of(
 
 
 def task(timeline: Timeline, **changes: Any) -> ForecastTask:
-    asked = ForecastTask(head(timeline), ForecastMode.FULL, 5, 6, 3, 9, None, True)
+    asked = ForecastTask(head(timeline), ForecastMode.FULL, 5, 6, 3, 9, None, True, Sampling.IID)
     return dataclasses.replace(asked, **changes)
 
 

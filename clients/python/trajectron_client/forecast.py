@@ -102,7 +102,9 @@ class Forecast:
         reference_time: of the frame that the forecast starts from, on your clock.
         time_offsets_s: [H] seconds after ``reference_time``, the first above zero.
         agents: the agents, in the order asked for.
-        sample_semantics: how samples of several agents go together.
+        sample_semantics: how samples go together: those of different agents are independent of
+            each other given the histories; those of one agent are independent
+            (``"independent_agents"``) or stratified (``"independent_agents_stratified"``).
     """
 
     model: str

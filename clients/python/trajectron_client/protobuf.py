@@ -52,6 +52,7 @@ def forecast_options(**options: Unpack[ForecastOptions]) -> pb.ForecastOptions:
         seed=options.get("seed"),
         agent_ids=options.get("agents") or (),
         include_modes=options.get("include_modes"),
+        sampling=pb.Sampling.Value(f"SAMPLING_{options.get('sampling', 'iid').upper()}"),
     )
 
 

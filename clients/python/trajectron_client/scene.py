@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 ForecastMode = Literal["full", "z_best", "gmm"]
+Sampling = Literal["iid", "stratified"]
 UnknownTypes = Literal["reject", "ignore", "map"]
 Delivery = Literal["all", "latest"]
 
@@ -84,6 +85,9 @@ class ForecastOptions(TypedDict, total=False):
         agents: ids of the agents to forecast; all in the scene by default.
         include_modes: whether each mode's mean and covariance are returned; by default for
             ``"gmm"`` only.
+        sampling: how one agent's samples go together: ``"iid"`` (the default), or ``"stratified"``:
+            spread evenly over the distribution, so that a few cover more of it. Each alone has
+            the same distribution, and agents are independent, either way.
     """
 
     mode: ForecastMode
@@ -92,6 +96,7 @@ class ForecastOptions(TypedDict, total=False):
     seed: int | None
     agents: Sequence[str] | None
     include_modes: bool | None
+    sampling: Sampling
 
 
 class SessionOptions(TypedDict, total=False):

@@ -59,6 +59,36 @@ FORECAST_MODE_GMM: ForecastMode.ValueType  # 3
 """No sampling: every latent value as a Gaussian in position space per step."""
 Global___ForecastMode: _TypeAlias = ForecastMode  # noqa: Y015
 
+class _Sampling:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _SamplingEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Sampling.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    SAMPLING_UNSPECIFIED: _Sampling.ValueType  # 0
+    """Means SAMPLING_IID."""
+    SAMPLING_IID: _Sampling.ValueType  # 1
+    """Independent."""
+    SAMPLING_STRATIFIED: _Sampling.ValueType  # 2
+    """Spread evenly over the distribution, so that a few cover more of it: latent
+    values in their probabilities' shares, quasi-random noise.
+    """
+
+class Sampling(_Sampling, metaclass=_SamplingEnumTypeWrapper):
+    """How the samples of one agent go together. Each alone has the same distribution,
+    and agents are independent of each other, either way.
+    """
+
+SAMPLING_UNSPECIFIED: Sampling.ValueType  # 0
+"""Means SAMPLING_IID."""
+SAMPLING_IID: Sampling.ValueType  # 1
+"""Independent."""
+SAMPLING_STRATIFIED: Sampling.ValueType  # 2
+"""Spread evenly over the distribution, so that a few cover more of it: latent
+values in their probabilities' shares, quasi-random noise.
+"""
+Global___Sampling: _TypeAlias = Sampling  # noqa: Y015
+
 class _UnknownTypePolicy:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -131,14 +161,26 @@ class _SampleSemanticsEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Sampl
     DESCRIPTOR: _descriptor.EnumDescriptor
     SAMPLE_SEMANTICS_UNSPECIFIED: _SampleSemantics.ValueType  # 0
     SAMPLE_SEMANTICS_INDEPENDENT_AGENTS: _SampleSemantics.ValueType  # 1
-    """Agents' samples are independent of each other given the histories."""
+    """Agents' samples are independent of each other given the histories, and so
+    are those of one agent.
+    """
+    SAMPLE_SEMANTICS_INDEPENDENT_AGENTS_STRATIFIED: _SampleSemantics.ValueType  # 2
+    """Agents' samples are independent of each other given the histories; those of
+    one agent are stratified (SAMPLING_STRATIFIED).
+    """
 
 class SampleSemantics(_SampleSemantics, metaclass=_SampleSemanticsEnumTypeWrapper):
-    """How samples of several agents go together."""
+    """How samples go together."""
 
 SAMPLE_SEMANTICS_UNSPECIFIED: SampleSemantics.ValueType  # 0
 SAMPLE_SEMANTICS_INDEPENDENT_AGENTS: SampleSemantics.ValueType  # 1
-"""Agents' samples are independent of each other given the histories."""
+"""Agents' samples are independent of each other given the histories, and so
+are those of one agent.
+"""
+SAMPLE_SEMANTICS_INDEPENDENT_AGENTS_STRATIFIED: SampleSemantics.ValueType  # 2
+"""Agents' samples are independent of each other given the histories; those of
+one agent are stratified (SAMPLING_STRATIFIED).
+"""
 Global___SampleSemantics: _TypeAlias = SampleSemantics  # noqa: Y015
 
 class _StreamDelivery:
@@ -253,6 +295,7 @@ class ForecastOptions(_message.Message):
     SEED_FIELD_NUMBER: _builtins.int
     AGENT_IDS_FIELD_NUMBER: _builtins.int
     INCLUDE_MODES_FIELD_NUMBER: _builtins.int
+    SAMPLING_FIELD_NUMBER: _builtins.int
     mode: Global___ForecastMode.ValueType
     num_samples: _builtins.int
     """Futures per agent, 1 to 2000; default 20. Ignored by FORECAST_MODE_GMM."""
@@ -266,6 +309,8 @@ class ForecastOptions(_message.Message):
     """Whether mean and covariance of every mode are returned; default: only for
     FORECAST_MODE_GMM. Mode probabilities are always returned.
     """
+    sampling: Global___Sampling.ValueType
+    """Ignored by FORECAST_MODE_GMM."""
     @_builtins.property
     def agent_ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Only these agents; all agents in the scene when empty."""
@@ -279,10 +324,11 @@ class ForecastOptions(_message.Message):
         seed: _builtins.int | None = ...,
         agent_ids: _abc.Iterable[_builtins.str] | None = ...,
         include_modes: _builtins.bool | None = ...,
+        sampling: Global___Sampling.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "horizon", b"horizon", "include_modes", b"include_modes", "num_samples", b"num_samples", "seed", b"seed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "agent_ids", b"agent_ids", "horizon", b"horizon", "include_modes", b"include_modes", "mode", b"mode", "num_samples", b"num_samples", "seed", b"seed"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "agent_ids", b"agent_ids", "horizon", b"horizon", "include_modes", b"include_modes", "mode", b"mode", "num_samples", b"num_samples", "sampling", b"sampling", "seed", b"seed"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__horizon: _TypeAlias = _typing.Literal["horizon"]  # noqa: Y015
     _WhichOneofArgType__horizon: _TypeAlias = _typing.Literal["_horizon", b"_horizon"]  # noqa: Y015

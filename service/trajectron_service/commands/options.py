@@ -47,6 +47,14 @@ Seed = Annotated[
     int | None,
     typer.Option("--seed", min=0, help="The same seed gives the same samples; drawn by default."),
 ]
+Sampling = Annotated[
+    Literal["iid", "stratified"],
+    typer.Option(
+        "--sampling",
+        help="`iid`: an agent's samples are independent; `stratified`: spread evenly over the "
+        "same distribution.",
+    ),
+]
 FramesPerStep = Annotated[
     int,
     typer.Option(

@@ -14,6 +14,7 @@ from trajectron_service.commands.options import (
     Model,
     RecordingFile,
     Samples,
+    Sampling,
     Seed,
     out,
 )
@@ -50,6 +51,7 @@ def predict(
     samples: Samples = 20,
     horizon: Horizon = None,
     seed: Seed = None,
+    sampling: Sampling = "iid",
     agents: Annotated[
         str | None, typer.Option(metavar="ID,...", help="Only these agents; all by default.")
     ] = None,
@@ -81,6 +83,7 @@ def predict(
     from trajectron_service.commands.offline import forecast_offline
     from trajectron_service.commands.recordings import scenes, step_at
     from trajectron_service.messages import ForecastMode, ForecastOptions
+    from trajectron_service.messages import Sampling as SamplingChoice
 
     if plot is not None:
         _check_format(plot)
@@ -94,6 +97,7 @@ def predict(
         seed=seed,
         agents=tuple(agents.split(",")) if agents else None,
         include_modes=None if json and plot is None else True,
+        sampling=SamplingChoice(sampling),
     )
     seen = tuple(scenes(recording, first, step + 1))
     forecast = forecast_offline(model, seen, options, recording.dt_s)

@@ -12,6 +12,7 @@ from trajectron_service.commands.options import (
     Mode,
     RecordingFile,
     Samples,
+    Sampling,
     Seed,
 )
 
@@ -54,6 +55,7 @@ def replay(
     samples: Samples = 20,
     horizon: Horizon = None,
     seed: Seed = None,
+    sampling: Sampling = "iid",
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Only the summary, no line for each frame.")
     ] = False,
@@ -94,6 +96,7 @@ def replay(
                 horizon=horizon,
                 seed=seed,
                 include_modes=True,
+                sampling=sampling,
             ),
         )
     )
