@@ -101,8 +101,8 @@ def _paper_window(recording: Recording, first: int, observed: int) -> Window:
     future = first + observed  # the first step to foretell
     agents, position = recording.dense(future - _STRIDE, future + 1)
     present = ~np.isnan(position[..., 0])  # [9, A']
-    judged: NDArray[np.bool_] = present[-2:].all(axis=0)
-    whole: NDArray[np.bool_] = present.all(axis=0)
+    judged: NDArray[np.bool_] = np.logical_and.reduce(present[-2:])
+    whole: NDArray[np.bool_] = np.logical_and.reduce(present)
     return Window(recording, first, observed, HORIZON, agents[judged], whole[judged])
 
 

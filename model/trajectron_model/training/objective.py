@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from trajectron_model.features import Kinematics, to_frame
-from trajectron_model.forecast import start_velocity
+from trajectron_model.features import Kinematics
 from trajectron_model.latent import categorical_kl
+from trajectron_model.likelihood import true_velocity, velocity_likelihood
 from trajectron_model.training.examples import Batch
 from trajectron_model.trajectron import Trajectron, rows_by_type
 
@@ -91,8 +91,9 @@ class _Targets(NamedTuple):
 
     kind: int
     encoding: Tensor  # [B, D]
-    velocity: Tensor  # [B, 2] last, in the agent's frame over the speed scale, as is the next
-    future: Tensor  # [B, H, 2] with label noise
+    motion: Kinematics  # of the B agents
+    axis: Tensor  # [B, 2] the first axis of each agent's frame
+    velocity_mps: Tensor  # [B, H, 2] true ones, with label noise
     known: Tensor  # [B, H]
 
 
@@ -102,9 +103,8 @@ def _targets(
     """The batch encoded, one part for each type in it."""
     device = model.device
     encoded = model.encode(batch.past, batch.rows)
-    last = encoded.motion.position.unsqueeze(1)  # [B, 1, 2]
-    track = torch.cat([last, torch.from_numpy(batch.future).to(device)], dim=1)
-    velocity = (track.diff(dim=1) / model.config.dt_s).float()  # [B, H, 2] m/s
+    future = torch.from_numpy(batch.future).to(device)
+    velocity = true_velocity(encoded.motion, future, model.config.dt_s)  # [B, H, 2]
     noise = random.normal(0.0, settings.label_noise_mps, velocity.shape).astype(np.float32)
     velocity = velocity + torch.from_numpy(noise).to(device)
     # Without a heading no direction is special: each draws a frame of its own.
@@ -113,7 +113,6 @@ def _targets(
     axis = model.features.frame(encoded.motion)
     if model.features.isotropic_without_heading:
         axis = torch.where(encoded.motion.heading_known.unsqueeze(-1), axis, any_axis)
-    future = to_frame(velocity, axis.unsqueeze(1))
     known = torch.from_numpy(batch.known).to(device)
     encoding = encoded.encoding
     if settings.encoding_dropout and model.training:
@@ -123,8 +122,9 @@ def _targets(
         _Targets(
             kind,
             encoding[index],
-            start_velocity(model, Kinematics(*(column[index] for column in encoded.motion)), kind),
-            future[index] / model.config.types[kind].speed_scale_mps,
+            Kinematics(*(column[index] for column in encoded.motion)),
+            axis[index],
+            velocity[index],
             known[index],
         )
         for kind, index in rows_by_type(encoded.node_type)
@@ -132,12 +132,7 @@ def _targets(
 
 
 def _terms(model: Trajectron, target: _Targets, name: str, beta: float) -> LossTerms:
-    part = model.node_model(target.kind).likelihood(
-        target.encoding, target.velocity, target.future, target.known
-    )
-    # Densities over velocity in m/s, whatever the type's unit of speed inside the network.
-    jacobian = 2.0 * math.log(model.config.types[target.kind].speed_scale_mps)
-    part = part._replace(log_prob=part.log_prob - jacobian * part.steps.unsqueeze(-1))
+    part = velocity_likelihood(model, *target)
     log_prob, log_prior, log_q = part.log_prob, part.log_prior, part.log_recognition
     nll = -torch.logsumexp(log_prior + log_prob, dim=-1)
     reconstruction = -(log_q.exp() * log_prob).sum(dim=-1)
