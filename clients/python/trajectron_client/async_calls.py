@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Iterable, Mapping
 from typing import TypeVar, Unpack
 
 from trajectron_client import operations
+from trajectron_client.async_evaluations import AsyncEvaluations
 from trajectron_client.exceptions import TrajectronError, UnknownSessionError
 from trajectron_client.forecast import Forecast
 from trajectron_client.replies import FrameResult, ModelInfo, SessionInfo, SessionSnapshot
@@ -16,17 +17,13 @@ from trajectron_client.scene import ForecastOptions, Frame, SessionOptions, Unkn
 T = TypeVar("T")
 
 
-class AsyncCalls(abc.ABC):
+class AsyncCalls(AsyncEvaluations):
     """What one can ask of the service.
 
     Every call takes ``timeout_s``, in place of the client's own, and raises
     ``DeadlineExceededError`` when no answer came in time, ``TransportError`` when the service
     could not be reached, and otherwise the errors named, or others below ``ServiceError``.
     """
-
-    @abc.abstractmethod
-    async def _run(self, operation: operations.Operation[T], timeout_s: float | None) -> T:
-        """Carries a call out."""
 
     @abc.abstractmethod
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:

@@ -7,15 +7,20 @@ TrajectronError
     │   └── MalformedError          the request could not be read at all
     ├── NotFoundError
     │   ├── UnknownSessionError     never opened, deleted, or idle for too long
+    │   ├── UnknownEvaluationError  never created, or deleted
     │   ├── UnknownModelError
     │   └── UnknownAgentError
     ├── ConflictError
     │   ├── SessionExistsError
     │   ├── FrameConflictError      the newest frame's time with other content
     │   ├── FrameOutOfOrderError    earlier than the newest frame
-    │   └── NoFramesError           a forecast before the first frame
+    │   ├── NoFramesError           a forecast before the first frame
+    │   ├── EvaluationExistsError
+    │   ├── NoResultError           of an evaluation that has not succeeded
+    │   └── DatasetUnavailableError
     ├── ResourceExhaustedError
     │   ├── TooManySessionsError
+    │   ├── TooManyEvaluationsError
     │   ├── TooLargeError
     │   └── OverloadedError         the queue is full; see ``retry_after_s``
     ├── DrainingError               the server is stopping; another replica may answer
@@ -86,6 +91,10 @@ class UnknownSessionError(NotFoundError):
     """The session was never opened, was deleted, or was idle for too long."""
 
 
+class UnknownEvaluationError(NotFoundError):
+    """The evaluation was never created, or was deleted."""
+
+
 class UnknownModelError(NotFoundError):
     """The server does not run this model."""
 
@@ -95,7 +104,7 @@ class UnknownAgentError(NotFoundError):
 
 
 class ConflictError(ServiceError):
-    """The request does not fit the state of the session."""
+    """The request does not fit the state of what it is about."""
 
 
 class SessionExistsError(ConflictError):
@@ -114,12 +123,28 @@ class NoFramesError(ConflictError):
     """The session has seen no frame yet."""
 
 
+class EvaluationExistsError(ConflictError):
+    """The id is taken."""
+
+
+class NoResultError(ConflictError):
+    """The evaluation has not ended, or has not succeeded."""
+
+
+class DatasetUnavailableError(ConflictError):
+    """The server knows the data set but has not got it."""
+
+
 class ResourceExhaustedError(ServiceError):
     """A limit of the server was reached."""
 
 
 class TooManySessionsError(ResourceExhaustedError):
     """The server holds as many sessions as it may."""
+
+
+class TooManyEvaluationsError(ResourceExhaustedError):
+    """The server keeps as many evaluations as it may; delete some."""
 
 
 class TooLargeError(ResourceExhaustedError):
@@ -156,6 +181,11 @@ BY_REASON: dict[str, type[ServiceError]] = {
     "FRAME_CONFLICT": FrameConflictError,
     "FRAME_OUT_OF_ORDER": FrameOutOfOrderError,
     "NO_FRAMES": NoFramesError,
+    "UNKNOWN_EVALUATION": UnknownEvaluationError,
+    "EVALUATION_EXISTS": EvaluationExistsError,
+    "EVALUATION_HAS_NO_RESULT": NoResultError,
+    "DATASET_UNAVAILABLE": DatasetUnavailableError,
+    "TOO_MANY_EVALUATIONS": TooManyEvaluationsError,
     "TOO_MANY_SESSIONS": TooManySessionsError,
     "TOO_LARGE": TooLargeError,
     "OVERLOADED": OverloadedError,

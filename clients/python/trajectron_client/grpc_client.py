@@ -11,8 +11,9 @@ from typing import Any, Self, TypeVar, Unpack
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from trajectron_client import protobuf
+from trajectron_client import evaluation_operations, evaluations, operations, protobuf
 from trajectron_client.async_calls import AsyncCalls
+from trajectron_client.evaluations import Evaluation
 from trajectron_client.exceptions import DeadlineExceededError, TransportError
 from trajectron_client.grpc_errors import translated
 from trajectron_client.operations import Operation
@@ -25,8 +26,8 @@ from trajectron_client.scene import (
 )
 from trajectron_client.streams import AsyncCall, AsyncStream, Stream, SyncCall
 from trajectron_client.sync_calls import SyncCalls
+from trajectron_proto.v1 import evaluation_pb2, evaluation_pb2_grpc, trajectron_pb2_grpc
 from trajectron_proto.v1 import trajectron_pb2 as pb
-from trajectron_proto.v1 import trajectron_pb2_grpc
 
 T = TypeVar("T")
 Metadata = Sequence[tuple[str, str | bytes]]
@@ -34,13 +35,19 @@ Metadata = Sequence[tuple[str, str | bytes]]
 # 200 samples x 12 steps of 2000 agents are 38 MB.
 _MAX_ANSWER_BYTES = 64 * 1024 * 1024
 # Calls that change nothing, so that sending one twice does no harm.
-_SAFE_TO_REPEAT = ("Predict", "PredictSession", "GetSession", "ListSessions", "ListModels")
+_SAFE_TO_REPEAT = {
+    operations.SERVICE: (
+        "Predict", "PredictSession", "GetSession", "ListSessions", "ListModels",
+    ),
+    evaluation_operations.SERVICE: ("GetEvaluation", "ListEvaluations", "GetEvaluationResult"),
+}  # fmt: skip
 _SERVICE_CONFIG = {
     "methodConfig": [
         {
             "name": [
-                {"service": "trajectron.v1.TrajectronService", "method": method}
-                for method in _SAFE_TO_REPEAT
+                {"service": service, "method": method}
+                for service, methods in _SAFE_TO_REPEAT.items()
+                for method in methods
             ],
             "retryPolicy": {
                 "maxAttempts": 4,
@@ -87,6 +94,7 @@ class Client(SyncCalls):
             else grpc.secure_channel(target, credentials, merged)
         )
         self._stub = trajectron_pb2_grpc.TrajectronServiceStub(self._channel)
+        self._evaluations = evaluation_pb2_grpc.EvaluationServiceStub(self._channel)
         self._health: Any = health_pb2_grpc.HealthStub(self._channel)
 
     def close(self) -> None:
@@ -176,8 +184,24 @@ class Client(SyncCalls):
 
         return Stream(start, opening, frames)
 
+    def watch_evaluation(
+        self, evaluation_id: str, *, timeout_s: float | None = None
+    ) -> Iterator[Evaluation]:
+        """See ``SyncEvaluations``."""
+        request = evaluation_pb2.WatchEvaluationRequest(evaluation_id=evaluation_id)
+        call = self._evaluations.WatchEvaluation(
+            request, timeout=timeout_s, metadata=self._metadata
+        )
+        try:
+            with translated():
+                for reply in call:
+                    yield evaluations.from_message(reply.evaluation)
+        finally:
+            call.cancel()
+
     def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
-        call = getattr(self._stub, operation.rpc)
+        ours = operation.service == operations.SERVICE
+        call = getattr(self._stub if ours else self._evaluations, operation.rpc)
         request = operation.message()
         with translated():
             reply = call(
@@ -222,6 +246,7 @@ class AsyncClient(AsyncCalls):
             else grpc.aio.secure_channel(target, credentials, merged)
         )
         self._stub = trajectron_pb2_grpc.TrajectronServiceStub(self._channel)
+        self._evaluations = evaluation_pb2_grpc.EvaluationServiceStub(self._channel)
         self._health: Any = health_pb2_grpc.HealthStub(self._channel)
 
     async def close(self) -> None:
@@ -293,8 +318,24 @@ class AsyncClient(AsyncCalls):
 
         return AsyncStream(start, opening, frames)
 
+    async def watch_evaluation(
+        self, evaluation_id: str, *, timeout_s: float | None = None
+    ) -> AsyncIterator[Evaluation]:
+        """See ``AsyncEvaluations``."""
+        request = evaluation_pb2.WatchEvaluationRequest(evaluation_id=evaluation_id)
+        call: Any = self._evaluations.WatchEvaluation(
+            request, timeout=timeout_s, metadata=self._metadata
+        )
+        try:
+            with translated():
+                async for reply in call:
+                    yield evaluations.from_message(reply.evaluation)
+        finally:
+            call.cancel()
+
     async def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
-        call = getattr(self._stub, operation.rpc)
+        ours = operation.service == operations.SERVICE
+        call = getattr(self._stub if ours else self._evaluations, operation.rpc)
         request = operation.message()
         with translated():
             reply = await call(

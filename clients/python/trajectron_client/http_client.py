@@ -1,4 +1,4 @@
-"""The clients over HTTP: no streams, for where only HTTP gets through."""
+"""The clients over HTTP: no streams of forecasts, for where only HTTP gets through."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import httpx
+from httpx_sse import SSEError, aconnect_sse, connect_sse
 
-from trajectron_client import http_errors
+from trajectron_client import http_errors, http_events
 from trajectron_client.async_calls import AsyncCalls
+from trajectron_client.evaluation_operations import path
+from trajectron_client.evaluations import Evaluation
 from trajectron_client.exceptions import (
     DeadlineExceededError,
     TransportError,
@@ -86,6 +89,19 @@ class HttpClient(SyncCalls):
                 raise _not_ready(timeout_s)
             time.sleep(_READY_POLL_S)
 
+    def watch_evaluation(
+        self, evaluation_id: str, *, timeout_s: float | None = None
+    ) -> Iterator[Evaluation]:
+        """See ``SyncEvaluations``."""
+        where = f"{path(evaluation_id)}:watch"
+        timeout = http_events.timeout(timeout_s, self._timeout_s)
+        with _translated(), connect_sse(self._http, "GET", where, timeout=timeout) as events:
+            if not events.response.is_success:
+                events.response.read()
+                raise http_errors.from_response(events.response)
+            for event in events.iter_sse():
+                yield http_events.evaluation(event)
+
     def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
         with _translated():
             response = self._http.request(
@@ -153,6 +169,21 @@ class AsyncHttpClient(AsyncCalls):
         except TimeoutError:
             raise _not_ready(timeout_s) from None
 
+    async def watch_evaluation(
+        self, evaluation_id: str, *, timeout_s: float | None = None
+    ) -> AsyncIterator[Evaluation]:
+        """See ``AsyncEvaluations``."""
+        where = f"{path(evaluation_id)}:watch"
+        timeout = http_events.timeout(timeout_s, self._timeout_s)
+        with _translated():
+            async with aconnect_sse(self._http, "GET", where, timeout=timeout) as events:
+                if not events.response.is_success:
+                    await events.response.aread()
+                    raise http_errors.from_response(events.response)
+                async with contextlib.aclosing(events.aiter_sse()) as told:
+                    async for event in told:
+                        yield http_events.evaluation(event)
+
     async def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
         with _translated():
             response = await self._http.request(
@@ -162,17 +193,25 @@ class AsyncHttpClient(AsyncCalls):
 
 
 def _request(operation: Operation[Any]) -> dict[str, Any]:
-    request = {"url": operation.path, "params": operation.params}
+    headers = dict(operation.headers)
+    request: dict[str, Any] = {"url": operation.path, "params": operation.params}
     body = operation.body()
     if body is None:
-        return request
+        return request | {"headers": headers}
     # Not httpx's own encoder: it refuses NaN, which is the service's to refuse, by field.
-    return request | {"content": json.dumps(body), "headers": {"content-type": "application/json"}}
+    text = json.dumps(body)
+    field, files = operation.files()
+    if files:
+        form = [(field, (None, text, "application/json")), *(("files", file) for file in files)]
+        return request | {"files": form, "headers": headers}
+    return request | {"content": text, "headers": headers | {"content-type": "application/json"}}
 
 
 def _answer(operation: Operation[T], response: httpx.Response) -> T:
     if not response.is_success:
         raise http_errors.from_response(response)
+    if operation.raw:
+        return operation.from_body(response.content)
     return operation.from_body(response.json() if response.content else None)
 
 
@@ -190,5 +229,5 @@ def _not_ready(timeout_s: float) -> DeadlineExceededError:
 def _translated() -> Iterator[None]:
     try:
         yield
-    except httpx.HTTPError as error:
+    except (httpx.HTTPError, SSEError) as error:
         raise http_errors.from_httpx(error) from error

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import httpx
 
 from trajectron_client.exceptions import (
     DeadlineExceededError,
+    ServiceError,
     TrajectronError,
     TransportError,
     Violation,
@@ -20,19 +22,22 @@ def from_response(response: httpx.Response) -> TrajectronError:
     if not response.headers.get("content-type", "").startswith("application/problem+json"):
         return _foreign(response)
     try:
-        problem = json.loads(response.content)
-        violations = tuple(
-            Violation(v["field"], v["description"]) for v in problem.get("violations", ())
-        )
-        reason, detail = problem["reason"], problem["detail"]
+        return from_problem(json.loads(response.content), _retry_after_s(response))
     except (ValueError, KeyError, TypeError, AttributeError):
         return _foreign(response)
+
+
+def from_problem(problem: dict[str, Any], retry_after_s: float | None) -> ServiceError:
+    """The exception for a problem of the service; raises KeyError or TypeError for another."""
+    violations = tuple(
+        Violation(v["field"], v["description"]) for v in problem.get("violations", ())
+    )
     return service_error(
-        reason, detail, violations=violations, retry_after_s=_retry_after_s(response)
+        problem["reason"], problem["detail"], violations=violations, retry_after_s=retry_after_s
     )
 
 
-def from_httpx(error: httpx.HTTPError) -> TrajectronError:
+def from_httpx(error: Exception) -> TrajectronError:
     """The exception for a call that got no answer."""
     kind = type(error).__name__
     if isinstance(error, httpx.TimeoutException):

@@ -5,7 +5,7 @@ The clients only carry an operation out, so all of them take and return the same
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 from urllib.parse import quote
@@ -20,6 +20,7 @@ from trajectron_proto.v1 import trajectron_pb2 as pb
 
 T = TypeVar("T")
 Json = dict[str, Any]
+SERVICE = "trajectron.v1.TrajectronService"
 
 
 def _no_body() -> None:
@@ -28,6 +29,14 @@ def _no_body() -> None:
 
 def _no_params() -> Mapping[str, str | int]:
     return {}
+
+
+def _no_headers() -> Mapping[str, str]:
+    return {}
+
+
+def _no_files() -> tuple[str, Sequence[tuple[str, bytes]]]:
+    return "", ()
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,10 @@ class Operation(Generic[T]):
         body: makes the JSON body; None for none.
         params: the query's parameters.
         from_body: reads the JSON answer.
+        service: the contract's service that has the method.
+        raw: whether ``from_body`` takes the answer's bytes as they are.
+        files: for a form: the field that holds the JSON, and names and contents of files.
+        headers: sent along over HTTP.
     """
 
     rpc: str
@@ -53,6 +66,10 @@ class Operation(Generic[T]):
     from_body: Callable[[Any], T]
     body: Callable[[], Json | None] = _no_body
     params: Mapping[str, str | int] = field(default_factory=_no_params)
+    service: str = SERVICE
+    raw: bool = False
+    files: Callable[[], tuple[str, Sequence[tuple[str, bytes]]]] = _no_files
+    headers: Mapping[str, str] = field(default_factory=_no_headers)
 
 
 def predict(

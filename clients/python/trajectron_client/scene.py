@@ -136,7 +136,7 @@ class StreamFrame:
     options: ForecastOptions | None = None
 
 
-def check_names(kind: type[ForecastOptions | SessionOptions], given: Iterable[str]) -> None:
+def check_names(kind: type[object], given: Iterable[str]) -> None:
     """Refuses an option that does not exist, as Python does for any other argument.
 
     Raises:

@@ -12,21 +12,18 @@ from trajectron_client.exceptions import TrajectronError, UnknownSessionError
 from trajectron_client.forecast import Forecast
 from trajectron_client.replies import FrameResult, ModelInfo, SessionInfo, SessionSnapshot
 from trajectron_client.scene import ForecastOptions, Frame, SessionOptions, UnknownTypes
+from trajectron_client.sync_evaluations import SyncEvaluations
 
 T = TypeVar("T")
 
 
-class SyncCalls(abc.ABC):
+class SyncCalls(SyncEvaluations):
     """What one can ask of the service.
 
     Every call takes ``timeout_s``, in place of the client's own, and raises
     ``DeadlineExceededError`` when no answer came in time, ``TransportError`` when the service
     could not be reached, and otherwise the errors named, or others below ``ServiceError``.
     """
-
-    @abc.abstractmethod
-    def _run(self, operation: operations.Operation[T], timeout_s: float | None) -> T:
-        """Carries a call out."""
 
     @abc.abstractmethod
     def is_ready(self, *, timeout_s: float | None = None) -> bool:
