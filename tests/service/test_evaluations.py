@@ -1,0 +1,337 @@
+"""Batch evaluations without a transport: their life, their order, and what survives a stop."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.contract.recordings import walkers
+
+from trajectron_service.errors import ErrorKind, ServiceError
+from trajectron_service.evaluations import queue
+from trajectron_service.evaluations.background import Background, told
+from trajectron_service.evaluations.folders import EvaluationFolder
+from trajectron_service.evaluations.jobs import Evaluations
+from trajectron_service.evaluations.messages import (
+    EvaluationConfig,
+    EvaluationInfo,
+    EvaluationProgress,
+    EvaluationState,
+    RecordingFile,
+    ResultFormat,
+)
+from trajectron_service.evaluations.requests import EvaluationChoices
+from trajectron_service.evaluations.running import FailedError
+from trajectron_service.metrics import Metrics
+from trajectron_service.settings import Settings, SettingsError
+from trajectron_service.work import WorkInHand
+
+Run = Callable[[EvaluationFolder, Callable[[EvaluationProgress], object]], Any]
+
+ASKED = EvaluationConfig(models=("constant-velocity",), dataset="eth_ucy", sets=("street",))
+DATA = {
+    "seconds_per_frame": 0.04,
+    "frames_per_step": 10,
+    "recordings": {},
+    "test_sets": {"street": [], "park": []},
+    "training": {},
+}
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    """A folder for the state, and a data set of two sets."""
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "splits.json").write_text(json.dumps(DATA))
+    return Settings(state_dir=tmp_path / "state", data=data, evaluation_priority="normal")
+
+
+@asynccontextmanager
+async def opened(settings: Settings) -> AsyncIterator[Evaluations]:
+    """Evaluations as a service has them from its start to its stop."""
+    metrics = Metrics()
+    evaluations = Evaluations(settings, metrics, WorkInHand(metrics))
+    try:
+        await evaluations.start()
+        yield evaluations
+    finally:
+        await evaluations.close()
+
+
+@pytest.fixture
+def carried(monkeypatch: pytest.MonkeyPatch) -> Callable[[Run], None]:
+    """Sets what becomes of an evaluation that is started, in place of a process."""
+
+    def use(run: Run) -> None:
+        async def carry_out(
+            folder: EvaluationFolder,
+            _data: Path | None,
+            _background: Background,
+            note: Callable[[EvaluationProgress], object],
+        ) -> None:
+            await run(folder, note)
+
+        monkeypatch.setattr(queue, "carry_out", carry_out)
+
+    return use
+
+
+async def forever(_folder: EvaluationFolder, note: Callable[[EvaluationProgress], object]) -> None:
+    """Comes to a quarter of the way."""
+    note(EvaluationProgress(0.25, 1, 4, "constant-velocity", "street", 3.0))
+    await asyncio.Event().wait()
+
+
+async def at_once(folder: EvaluationFolder, _note: Callable[[EvaluationProgress], object]) -> None:
+    """Succeeds with a result."""
+    (folder.run / "result.json").write_bytes(b"{}")
+
+
+async def create(evaluations: Evaluations, name: str = "", **changes: Any) -> EvaluationInfo:
+    """An evaluation of the street."""
+    return await evaluations.create(name, ASKED, (), "", **changes)
+
+
+async def until(evaluations: Evaluations, name: str, *states: EvaluationState) -> EvaluationInfo:
+    """The evaluation once it is in one of the states."""
+    async for info in evaluations.watch(name):
+        if info.state in states:
+            return info
+    raise AssertionError(f"{name} ended as {info.state}: {info.error}")
+
+
+async def test_evaluations_run_one_after_another_in_order(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    order: list[str] = []
+    active: set[str] = set()
+
+    async def note_order(folder: EvaluationFolder, _note: object) -> None:
+        order.append(folder.path.name)
+        active.add(folder.path.name)
+        await asyncio.sleep(0.01)
+        assert active == {folder.path.name}
+        active.clear()
+
+    carried(note_order)
+    async with opened(settings) as evaluations:
+        for name in ("z", "a", "m"):
+            await create(evaluations, name)
+        for name in ("z", "a", "m"):
+            ended = await until(evaluations, name, EvaluationState.SUCCEEDED)
+            assert ended.ended_at is not None and ended.started_at is not None
+            assert ended.created_at <= ended.started_at <= ended.ended_at
+    assert order == ["00000001", "00000002", "00000003"]
+
+
+async def test_what_runs_or_waits_at_the_stop_is_taken_up_at_the_next_start(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(forever)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "running")
+        await create(evaluations, "waiting")
+        await create(evaluations, "cancelled")
+        await evaluations.cancel("cancelled")
+        first = await until(evaluations, "running", EvaluationState.RUNNING)
+    carried(at_once)
+    async with opened(settings) as evaluations:
+        again = await until(evaluations, "running", EvaluationState.SUCCEEDED)
+        assert (again.created_at, again.started_at) == (first.created_at, first.started_at)
+        await until(evaluations, "waiting", EvaluationState.SUCCEEDED)
+        assert (await evaluations.get("cancelled")).state is EvaluationState.CANCELLED
+    async with opened(settings) as evaluations:
+        assert await evaluations.get("running") == again
+        assert (await evaluations.result("running", ResultFormat.JSON)).content == b"{}"
+
+
+async def test_without_a_folder_nothing_outlives_the_service(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(at_once)
+    alone = settings.model_copy(update={"state_dir": None})
+    async with opened(alone) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.SUCCEEDED)
+        folder = evaluations._archive.folder(1).path
+        assert folder.is_dir()
+    assert not folder.exists()
+    async with opened(alone) as evaluations:
+        assert await evaluations.list_page(None, "") == ((), "")
+
+
+async def test_two_services_do_not_share_a_folder(settings: Settings) -> None:
+    async with opened(settings):
+        with pytest.raises(SettingsError, match=r"state_dir: .*another service"):
+            async with opened(settings):
+                pass
+    async with opened(settings):
+        pass
+
+
+async def test_a_folder_that_is_no_store_of_ours_is_told(settings: Settings) -> None:
+    assert settings.state_dir is not None
+    settings.state_dir.mkdir()
+    (settings.state_dir / "evaluations.sqlite").write_bytes(b"no database" * 100)
+    with pytest.raises(SettingsError, match=r"state_dir: .*evaluations\.sqlite"):
+        async with opened(settings):
+            pass
+
+
+async def test_files_that_belong_to_no_evaluation_are_swept_up(settings: Settings) -> None:
+    assert settings.state_dir is not None
+    left = settings.state_dir / "evaluations" / "00000007" / "work"
+    left.mkdir(parents=True)
+    async with opened(settings) as evaluations:
+        assert not left.parent.exists()
+        assert await evaluations.list_page(None, "") == ((), "")
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (FailedError("street has no windows"), "street has no windows"),
+        (ZeroDivisionError("1/0"), "a fault of the service; its log has more"),
+    ],
+)
+async def test_what_fails_says_why_and_the_next_one_runs(
+    settings: Settings, carried: Callable[[Run], None], fault: Exception, reason: str
+) -> None:
+    async def fail(_folder: EvaluationFolder, _note: object) -> None:
+        raise fault
+
+    async with opened(settings) as evaluations:
+        carried(fail)
+        await create(evaluations, "a")
+        failed = await until(evaluations, "a", EvaluationState.FAILED)
+        assert failed.error == reason
+        with pytest.raises(ServiceError) as caught:
+            await evaluations.result("a", ResultFormat.JSON)
+        assert caught.value.kind is ErrorKind.EVALUATION_HAS_NO_RESULT
+        carried(at_once)
+        await create(evaluations, "b")
+        await until(evaluations, "b", EvaluationState.SUCCEEDED)
+
+
+async def test_a_client_that_goes_away_leaves_no_files_behind(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reading = asyncio.Event()
+
+    async def check(*_arguments: object) -> None:
+        reading.set()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr("trajectron_service.evaluations.jobs.check_recordings", check)
+    asked = EvaluationConfig(models=("constant-velocity",))
+    async with opened(settings) as evaluations:
+        file = RecordingFile("a.csv", walkers())
+        creating = asyncio.create_task(evaluations.create("a", asked, (file,), ""))
+        await reading.wait()
+        folder = evaluations._archive.folder(1).path
+        assert folder.is_dir()
+        creating.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await creating
+        assert not folder.exists()
+        assert evaluations._entering == 0
+
+
+async def test_no_more_are_kept_than_may_be(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(at_once)
+    async with opened(settings.model_copy(update={"max_evaluations": 1})) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.SUCCEEDED)
+        with pytest.raises(ServiceError) as caught:
+            await create(evaluations, "b")
+        assert caught.value.kind is ErrorKind.TOO_MANY_EVALUATIONS
+        await evaluations.delete("a")
+        await create(evaluations, "b")
+
+
+async def test_draining_refuses_calls_and_ends_watches(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(forever)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        watching = asyncio.create_task(until(evaluations, "a", EvaluationState.SUCCEEDED))
+        await until(evaluations, "a", EvaluationState.RUNNING)
+        evaluations.begin_drain()
+        for ask in (watching, evaluations.get("a"), create(evaluations, "b")):
+            with pytest.raises(ServiceError) as caught:
+                await ask
+            assert caught.value.kind is ErrorKind.DRAINING
+
+
+async def test_metrics_count_evaluations_by_state(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(at_once)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.SUCCEEDED)
+        text = evaluations._queue._metrics.render().decode()
+    assert 'trajectron_evaluations{state="succeeded"} 1.0' in text
+    assert 'trajectron_evaluations{state="running"} 0.0' in text
+    assert 'trajectron_evaluation_duration_seconds_count{state="succeeded"} 1.0' in text
+
+
+def test_the_sets_of_a_data_set_are_all_unless_named(settings: Settings) -> None:
+    choices = EvaluationChoices(settings, {})
+    every = EvaluationConfig(models=("constant-velocity",), dataset="eth_ucy")
+    assert choices.resolve(every, ()).sets == ("street", "park")
+    assert choices.resolve(ASKED, ()).sets == ("street",)
+    plan = choices.plan(choices.resolve(ASKED, ()), ())
+    assert (plan.entries, plan.sets, plan.files) == (("constant-velocity",), ("street",), ())
+    assert (plan.protocol, plan.samples, plan.seed) == ("sgan", 100, 0)
+
+
+def test_a_served_model_is_judged_by_its_own_files(settings: Settings, tmp_path: Path) -> None:
+    mine = {"mine": tmp_path / "mine", "eth_ucy": tmp_path / "eth_ucy"}
+    choices = EvaluationChoices(settings, mine)
+    config = EvaluationConfig(models=("mine", "eth_ucy", "eth_ucy-without-eth"), dataset="eth_ucy")
+    resolved = choices.resolve(config, ())
+    # A path, for a bundled model of the same name would be taken instead.
+    assert choices.plan(resolved, ()).entries == ("mine", "./eth_ucy", "eth_ucy-without-eth")
+    assert choices.model_files(resolved) == mine
+
+
+async def test_a_module_that_fails_leaves_its_reason_in_the_log(tmp_path: Path) -> None:
+    background = Background("low", 1)
+    async with background.process("missing", folder=tmp_path, log=tmp_path / "log") as process:
+        assert [value async for value in told(process)] == []
+        assert await process.wait() == 1
+    assert "evaluations.missing" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize("let_go", [True, False])
+async def test_a_process_beside_ends_with_the_service_and_with_its_block(
+    tmp_path: Path, let_go: bool
+) -> None:
+    endless = tmp_path / "endless.csv"
+    os.mkfifo(endless)  # reading it waits for a writer, who never comes
+    background = Background("normal", 1)
+    async with background.process("reading", "10", str(endless), folder=tmp_path) as process:
+        assert process.stdin is not None
+        if let_go:  # as when the service was killed
+            process.stdin.close()
+            assert await process.wait() == 1
+    assert process.returncode == (1 if let_go else -signal.SIGTERM)
+
+
+def test_the_last_words_of_a_process_are_its_reason(tmp_path: Path) -> None:
+    folder = EvaluationFolder(tmp_path)
+    assert folder.last_words() == ""
+    folder.log.write_text("Traceback\n  line 3\nMemoryError: no more\n\n")
+    assert folder.last_words() == "MemoryError: no more"
