@@ -58,6 +58,20 @@ def test_both_transports_give_the_same_futures(served: Served) -> None:
         np.testing.assert_allclose(agent.covariance, twin.covariance, atol=1e-4)
 
 
+def test_samples_are_stratified_when_asked_for(client: SyncCalls) -> None:
+    options: tc.ForecastOptions = {"num_samples": 50, "seed": 3, "sampling": "stratified"}
+    with client.session() as session:
+        session.observe_all([frame(0), frame(1)])
+        forecast = session.predict(**options)
+        again = session.predict(**options)
+    assert forecast.sample_semantics == "independent_agents_stratified"
+    for agent in forecast:
+        assert agent.samples is not None and agent.sample_modes is not None
+        np.testing.assert_array_equal(agent.samples, again[agent.id].samples)
+        drawn = np.bincount(agent.sample_modes, minlength=agent.mode_probabilities.size)
+        assert np.abs(drawn - 50 * agent.mode_probabilities).max() < 1.001
+
+
 def test_a_session_lives_for_its_block(client: SyncCalls) -> None:
     with client.session(agent_timeout_s=3.0) as session:
         for step in range(3):

@@ -109,6 +109,7 @@ async def test_an_unknown_method_is_unimplemented(channel: grpc.aio.Channel) -> 
     ("request_", "field"),
     [
         (pb.PredictRequest(options=pb.ForecastOptions(mode=99)), "options.mode"),  # type: ignore[arg-type]  # no such mode
+        (pb.PredictRequest(options=pb.ForecastOptions(sampling=9)), "options.sampling"),  # type: ignore[arg-type]  # no such sampling
         (pb.PredictRequest(unknown_types=99), "unknown_types"),  # type: ignore[arg-type]  # no such policy
     ],
 )

@@ -151,6 +151,7 @@ async def test_broken_json_is_400(http: httpx.AsyncClient, raw: bytes) -> None:
         ({"seed": -1}, "seed"),
         ({"seed": 2**64}, "seed"),
         ({"mode": "best"}, "mode"),
+        ({"sampling": "halton"}, "sampling"),
         ({"agents": "7"}, "agents"),
         ({"agents": [7]}, "agents[0]"),
         ({"include_modes": 1}, "include_modes"),

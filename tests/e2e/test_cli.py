@@ -147,11 +147,12 @@ def test_an_agent_out_of_sight_is_marked(cli: Cli, model: Path, crowd: Path) -> 
     assert "6, 0.8 s ago" in bob
 
 
+@pytest.mark.parametrize("sampling", ["iid", "stratified"])
 def test_json_is_what_the_service_answers(
-    cli: Cli, model: Path, crowd: Path, served: Served
+    cli: Cli, model: Path, crowd: Path, served: Served, sampling: str
 ) -> None:
     options = ("--samples", "3", "--horizon", "5", "--seed", "7", "--at", "2")
-    text = cli("predict", crowd, "--model", model, *options, "--json")
+    text = cli("predict", crowd, "--model", model, *options, "--sampling", sampling, "--json")
     Forecast.model_validate_json(text)
     with crowd.open() as file:
         rows = [row for row in csv.DictReader(file) if float(row["time"]) <= 2.0]
@@ -166,11 +167,13 @@ def test_json_is_what_the_service_answers(
         }
         for time in sorted({row["time"] for row in rows}, key=float)
     ]
-    body = {"frames": frames, "num_samples": 3, "horizon": 5, "seed": 7}
+    body = {"frames": frames, "num_samples": 3, "horizon": 5, "seed": 7, "sampling": sampling}
     answer = httpx.post(f"{served.http_url}/predict", json=body, timeout=60.0).json()
     ours = json.loads(text)
     assert ours.keys() == answer.keys()
     assert ours["model_hash"] == answer["model_hash"]
+    assert ours["sample_semantics"] == answer["sample_semantics"]
+    assert ours["sample_semantics"].endswith("stratified") == (sampling == "stratified")
     for agent, twin in zip(ours["agents"], answer["agents"], strict=True):
         assert agent.keys() == twin.keys()
         np.testing.assert_allclose(agent["samples"], twin["samples"], atol=1e-4)
@@ -222,6 +225,13 @@ def test_a_replay_keeps_its_own_rate_and_its_session(served: Served, crowd: Path
     session = httpx.get(f"{served.http_url}/v1/sessions/kept", timeout=60.0).json()
     assert session["version"] == 4
     httpx.delete(f"{served.http_url}/v1/sessions/kept", timeout=60.0)
+
+
+def test_a_replay_may_stratify_its_samples(served: Served, crowd: Path) -> None:
+    options = ("--speed", "0", "--mode", "full", "--sampling", "stratified", "--quiet")
+    result = in_a_process("replay", crowd, "--server", served.grpc_target, *options)
+    assert result.returncode == 0, result.stderr
+    assert f"{STEPS} in " in result.stdout
 
 
 def test_a_replay_to_nobody_says_so(crowd: Path) -> None:
