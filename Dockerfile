@@ -27,7 +27,8 @@ RUN python -m venv /opt/build \
 
 
 FROM python:3.11.14-slim-bookworm
-RUN useradd --system --uid 10001 --no-create-home trajectron
+RUN useradd --system --uid 10001 --no-create-home trajectron \
+    && install --directory --owner trajectron /var/lib/trajectron
 COPY --from=build /opt/venv /opt/venv
 # 0.0.0.0 on purpose: inside a container the loopback address is out of reach. Publish the
 # ports where they are wanted, as deploy/compose.yaml does.
@@ -38,6 +39,7 @@ ENV PATH=/opt/venv/bin:$PATH \
     TRAJECTRON_HOST=0.0.0.0 \
     TRAJECTRON_HTTP_PORT=8000 \
     TRAJECTRON_GRPC_PORT=50051 \
+    TRAJECTRON_STATE_DIR=/var/lib/trajectron \
     TRAJECTRON_LOG_FORMAT=json
 USER 10001
 EXPOSE 8000 50051

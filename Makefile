@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: help install serve test check format protos bench clean
+.PHONY: help install serve test check format protos bench paper clean
 
 help: ## show this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-9s %s\n", $$1, $$2}'
@@ -27,7 +27,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 install: $(INSTALLED) ## create .venv and install everything at exact versions
 
 serve: $(INSTALLED) ## start the service on 127.0.0.1 (HTTP 8000, gRPC 50051); ARGS="--help" for flags
-	exec $(BIN)/trajectron serve $(ARGS)
+	TRAJECTRON_STATE_DIR="$${TRAJECTRON_STATE_DIR-runs/service}" exec $(BIN)/trajectron serve $(ARGS)
 
 test: $(INSTALLED) ## run the tests; ARGS="-k name" for some
 	$(BIN)/python -m pytest $(ARGS)
@@ -50,6 +50,9 @@ protos: $(INSTALLED) ## generate the code of the contract and lint it
 bench: $(INSTALLED) ## time the model beside its bare matrix products, on one thread and on two
 	$(BIN)/python benchmarks/model.py --threads 1 --json benchmarks/results/model-1-thread.json
 	$(BIN)/python benchmarks/model.py --threads 2 --json benchmarks/results/model-2-threads.json
+
+paper: $(INSTALLED) ## measure the paper's figures and tables again (hours; goes on where it stopped); ARGS="--quick"
+	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 clean: ## remove the environment and every cache
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 START_S = 110.0
 STOP_S = 60.0
+LOG = "serve.log"
 
 
 class Served(NamedTuple):
@@ -30,31 +31,47 @@ def environment() -> dict[str, str]:
 
 
 @contextmanager
-def serving(model: Path, folder: Path) -> Iterator[Served]:
+def serving(model: Path, folder: Path, **settings: str) -> Iterator[Served]:
     """A service with one model on free ports, ready; stopped by SIGTERM at the end."""
-    log = folder / "serve.log"
-    command = ["serve", "--model", str(model), "--http-port", "0", "--grpc-port", "0"]
-    with log.open("w") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "trajectron_service", *command, "--log-format", "json"],
-            env=environment(),
-            stdout=file,
-            stderr=subprocess.STDOUT,
-        )
+    process, served = launch(model, folder, **settings)
     try:
-        ready = _wait_until_ready(process, log)
-        host = "127.0.0.1"
-        yield Served(f"http://{host}:{ready['http_port']}", f"{host}:{ready['grpc_port']}")
+        yield served
         process.send_signal(signal.SIGTERM)
-        assert process.wait(STOP_S) == 0, log.read_text()
+        assert process.wait(STOP_S) == 0, (folder / LOG).read_text()
     finally:
         process.kill()
         process.wait()
 
 
-def _wait_until_ready(process: subprocess.Popen[bytes], log: Path) -> dict[str, int]:
+def launch(
+    model: Path, folder: Path, *, start_s: float = START_S, **settings: str
+) -> tuple[subprocess.Popen[bytes], Served]:
+    """A service in a process that is the caller's to end, ready; its log is in the folder."""
+    log = folder / LOG
+    command = ["serve", "--model", str(model), "--http-port", "0", "--grpc-port", "0"]
+    variables = {f"TRAJECTRON_{name.upper()}": value for name, value in settings.items()}
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "trajectron_service", *command, "--log-format", "json"],
+            env=environment() | variables,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        ready = _wait_until_ready(process, log, start_s)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    host = "127.0.0.1"
+    return process, Served(f"http://{host}:{ready['http_port']}", f"{host}:{ready['grpc_port']}")
+
+
+def _wait_until_ready(
+    process: subprocess.Popen[bytes], log: Path, start_s: float
+) -> dict[str, int]:
     """The fields of the line that says that the service is ready."""
-    deadline = time.monotonic() + START_S
+    deadline = time.monotonic() + start_s
     while time.monotonic() < deadline:
         for line in log.read_text().splitlines():
             if line.startswith("{") and json.loads(line).get("event") == "ready":
