@@ -1,1 +1,1 @@
-"""Simple predictors to be judged beside the model, on the same windows."""
+"""Predictors to be judged beside the model, on the same windows; `registry` has them by name."""

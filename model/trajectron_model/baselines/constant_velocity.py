@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectron_model.baselines.randomness import window_generator
 from trajectron_model.data.windows import Window
 from trajectron_model.predictor import WindowForecast
 
@@ -51,7 +51,7 @@ class ConstantVelocity:
         if not self._heading_noise_deg:
             samples = np.broadcast_to(mean, (num_samples, *mean.shape))
             return WindowForecast(samples, mean, mean)
-        angle = _generator(window, seed).normal(
+        angle = window_generator(window, seed).normal(
             scale=np.radians(self._heading_noise_deg), size=(num_samples, len(now))
         )
         sine, cosine = np.sin(angle), np.cos(angle)  # [S, A]
@@ -71,10 +71,3 @@ class ConstantVelocity:
         """[..., A, H, 2] positions from [A, 2] and displacements per step [..., A, 2]."""
         steps = np.arange(1, horizon + 1)[:, None]  # [H, 1]
         return now[:, None, :] + steps * stride[..., None, :]
-
-
-def _generator(window: Window, seed: int) -> np.random.Generator:
-    """Noise that depends on the window alone, not on those beside it."""
-    key = f"{seed}/{window.recording.name}/{window.first}".encode()
-    digest = hashlib.sha256(key).digest()
-    return np.random.default_rng(int.from_bytes(digest[:16], "big"))
