@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 # The fastest a person has run (Graubner & Nixdorf 2011; paper, section "The Trajectron").
 PEDESTRIAN_SPEED_LIMIT_MPS = 12.42
@@ -46,6 +46,16 @@ def _check_number(name: str, value: object, least: float, most: float) -> None:
         raise ValueError(f"{name} is {value!r}; it must be a number from {least:g} to {most:g}")
 
 
+class Dispersion(NamedTuple):
+    """How the standard deviations of analytic modes are corrected at one step.
+
+    See ``dispersion.disperse``; (1, 0) leaves them as they are.
+    """
+
+    factor: float
+    contrast: float
+
+
 @dataclass(frozen=True)
 class NodeType:
     """A type of agent.
@@ -55,17 +65,23 @@ class NodeType:
         speed_limit_mps: bound on sampled speeds; 0 makes the type stationary (an obstacle):
             it influences others and is never forecast to move.
         speed_scale_mps: the unit of speed inside the network, about the type's usual speed.
+        dispersion: of analytic modes, at each step, fitted on validation data; the last holds
+            beyond. Empty before it is fitted.
     """
 
     name: str
     speed_limit_mps: float = PEDESTRIAN_SPEED_LIMIT_MPS
     speed_scale_mps: float = 1.0
+    dispersion: tuple[Dispersion, ...] = ()
 
     def __post_init__(self) -> None:
         if type(self.name) is not str or not self.name:
             raise ValueError("a node type needs a name, a text")
         _check_number(f"speed_limit_mps of {self.name!r}", self.speed_limit_mps, 0.0, 1e4)
         _check_number(f"speed_scale_mps of {self.name!r}", self.speed_scale_mps, 1e-3, 1e4)
+        for factor, contrast in self.dispersion:
+            _check_number(f"a factor of dispersion of {self.name!r}", factor, 1e-2, 1e2)
+            _check_number(f"a contrast of dispersion of {self.name!r}", contrast, -5.0, 5.0)
 
     @property
     def stationary(self) -> bool:
@@ -191,7 +207,7 @@ class ModelConfig:
             raise ValueError(f"unknown model settings: {', '.join(unknown)}")
         fields = dict(values)
         try:
-            fields["types"] = tuple(NodeType(**t) for t in values["types"])
+            fields["types"] = tuple(_node_type(t) for t in values["types"])
             fields["radii"] = tuple(EdgeRadius(**r) for r in values.get("radii", ()))
             for name in ("addition_filter", "removal_filter"):
                 if name in fields:
@@ -199,3 +215,8 @@ class ModelConfig:
             return cls(**fields)
         except (KeyError, TypeError) as error:
             raise ValueError(f"model settings do not fit: {error}") from error
+
+
+def _node_type(values: Mapping[str, Any]) -> NodeType:
+    dispersion = tuple(Dispersion(*step) for step in values.get("dispersion", ()))
+    return NodeType(**{**values, "dispersion": dispersion})

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trajectron_model.config import MAX_HORIZON, MAX_SAMPLES
+from trajectron_model.dispersion import disperse
 from trajectron_model.encoders import EncoderState
 from trajectron_model.features import Kinematics, from_frame, to_frame
 from trajectron_model.gmm import choose
@@ -244,7 +245,9 @@ def _fill_modes(
         return
     index = torch.tensor(wanted, device=agents.encoding.device)
     motion = Kinematics(*(column[index] for column in agents.motion))
-    mean, covariance = mode_moments(model, kind, agents.encoding[index], motion, horizon)
+    mean, covariance = mode_moments(
+        model, kind, agents.encoding[index], agents.log_prior[index], motion, horizon
+    )
     means, covariances = mean.cpu().numpy(), covariance.cpu().numpy()
     for row, i in enumerate(wanted):
         number, at = agents.keys[i]
@@ -254,13 +257,19 @@ def _fill_modes(
 
 
 def mode_moments(
-    model: Trajectron, kind: int, encoding: Tensor, motion: Kinematics, horizon: int
+    model: Trajectron,
+    kind: int,
+    encoding: Tensor,
+    log_prior: Tensor,
+    motion: Kinematics,
+    horizon: int,
 ) -> tuple[Tensor, Tensor]:
     """Position-space Gaussian of every latent value at every step.
 
     Args:
         kind: type index of the N nodes.
         encoding: [N, D] h_enc.
+        log_prior: [N, Z] log p(z|x).
         motion: of the N nodes.
         horizon: H.
 
@@ -279,15 +288,16 @@ def mode_moments(
     spread = [walk.step(increment[:, t]) * scale**2 for t in range(horizon)]
     covariance = torch.stack(spread, dim=1)  # [N Z, H, 3]
     mean = mean.reshape(nodes, values, horizon, 2)
-    covariance = covariance.reshape(nodes, values, horizon, 3)
+    floor = covariance.new_tensor([_VARIANCE_FLOOR_M2, 0.0, _VARIANCE_FLOOR_M2])
+    covariance = covariance.reshape(nodes, values, horizon, 3) + floor
+    covariance = disperse(covariance, log_prior, agent_type.dispersion)
     axis = model.features.frame(motion)[:, None, None, :]
     turned = _turned(model, motion)[:, None, None, None]
     square = mean.square().sum(-1) + covariance[..., 0] + covariance[..., 2]
     round_ = torch.stack([0.5 * square, torch.zeros_like(square), 0.5 * square], dim=-1)
     covariance = torch.where(turned, round_, _rotate(covariance, axis))
     mean = torch.where(turned, 0.0, from_frame(mean, axis))
-    floor = covariance.new_tensor([_VARIANCE_FLOOR_M2, 0.0, _VARIANCE_FLOOR_M2])
-    return mean, covariance + floor
+    return mean, covariance
 
 
 def _rotate(covariance: Tensor, axis: Tensor) -> Tensor:

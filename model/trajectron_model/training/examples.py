@@ -29,7 +29,9 @@ class ExampleSettings:
         long_history: share of batches whose history is up to twice ``observed_steps``.
         mirror: whether half of the scenes are mirrored.
         scale: scenes are stretched by a factor from [1 / (1 + scale), 1 + scale].
-        input_noise_m: standard deviation of noise on observed positions.
+        input_noise_m: the roughest noise on observed positions. A scene's standard deviation
+            is this times the square of a uniform number: most scenes are nearly clean, some
+            as rough as a poor tracker's tracks, and the encoder has to tell which.
     """
 
     agents: int = 128
@@ -38,7 +40,7 @@ class ExampleSettings:
     long_history: float = 0.1
     mirror: bool = True
     scale: float = 0.3
-    input_noise_m: float = 0.01
+    input_noise_m: float = 0.1
 
 
 class Batch(NamedTuple):
@@ -131,7 +133,8 @@ class Examples:
         future = np.nan_to_num(position[steps:, rows]).transpose(1, 0, 2)
         past = np.nan_to_num(position[:steps])
         if self.settings.input_noise_m:
-            past = past + random.normal(0.0, self.settings.input_noise_m, past.shape)
+            deviation = self.settings.input_noise_m * random.random() ** 2
+            past = past + random.normal(0.0, deviation, past.shape)
         scene = np.zeros(len(kinds), dtype=np.int64)
         return Batch(History(past, present[:steps], kinds, scene), rows, future, known[:, rows].T)
 

@@ -16,6 +16,7 @@ from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.features import WORLD_FEATURES, WorldFeatures
 from trajectron_model.training import resuming
+from trajectron_model.training.calibration import calibrated
 from trajectron_model.training.examples import Examples
 from trajectron_model.training.objective import LossTerms, loss_terms
 from trajectron_model.training.settings import TrainSettings
@@ -60,7 +61,7 @@ def train(
     device: str | None = None,
     resume: bool = False,
 ) -> Checkpoint:
-    """Trains a model and leaves the best one, by validation, in ``folder``.
+    """Trains a model, leaves the best one, by validation, in ``folder``, and calibrates it.
 
     Args:
         config: of the model.
@@ -118,7 +119,16 @@ def train(
                 save(folder / CHECKPOINT_NAME, model, {**facts, "selected": selected})
             resuming.save(folder, model, optimiser, run)
         observe(Progress(run.step, rate, terms, figures, run.best_step))
-    return Checkpoint.load(folder / CHECKPOINT_NAME)
+    return _with_calibration(folder / CHECKPOINT_NAME, judge, device)
+
+
+def _with_calibration(path: Path, judge: Validation, device: str | None) -> Checkpoint:
+    """The checkpoint, saved anew with its modes' spread fitted to validation data."""
+    best = Checkpoint.load(path)
+    model = best.model.to(device or best.model.device)
+    model.config = calibrated(model, judge.calibration_windows)
+    save(path, model, best.provenance)
+    return Checkpoint.load(path)
 
 
 def _gradient_step(

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from trajectron_model.evaluation import metrics
 from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window, sgan_windows
+from trajectron_model.evaluation import metrics
 from trajectron_model.predictor import TrajectronPredictor
 from trajectron_model.training.examples import Examples, ExampleSettings
 from trajectron_model.training.objective import LossTerms, ObjectiveSettings, loss_terms
@@ -21,6 +21,7 @@ from trajectron_model.trajectron import Trajectron
 _SAMPLES = 20
 _SEED = 20191027
 _LOSS_BATCHES = 4
+_CALIBRATION_AGENTS = 400
 
 
 class ValidationFigures(NamedTuple):
@@ -65,6 +66,7 @@ class Validation:
         config = model.config
         found = [_windows(recording, config) for recording in recordings]
         self.windows = [_thin(windows, max_agents) for windows in found if windows]
+        self.calibration_windows = [_thin(w, _CALIBRATION_AGENTS) for w in found if w]
         if not self.windows:
             raise ValueError(
                 "the validation data has no agent that is seen for "
