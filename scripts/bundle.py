@@ -16,6 +16,7 @@ from typing import Any
 from trajectron_model import checkpoint, registry
 from trajectron_model.checkpoint import Checkpoint
 from trajectron_model.data.eth_ucy import TEST_SETS
+from trajectron_model.evaluation.judging import BEST_OF
 
 WEIGHTS = Path(registry.__file__).parent / "weights"
 
@@ -36,7 +37,31 @@ def errors_of(evaluation: dict[str, Any], test_set: str, sha256: str) -> dict[st
         raise SystemExit(f"the evaluation has no out-of-sample row of {sha256[:8]} on {test_set}")
     fingerprint = evaluation["fingerprint"]
     of_set = next(s for s in fingerprint["sets"] if s["test_set"] == test_set)
-    return {"errors_m": found[0]["scores"], "fingerprint": {**fingerprint, "sets": [of_set]}}
+    return {
+        "errors_m": errors_m(found[0]["scores"]["metrics"]),
+        "fingerprint": {**fingerprint, "sets": [of_set]},
+    }
+
+
+def errors_m(metrics: dict[str, Any]) -> dict[str, Any]:
+    """The displacement errors among an evaluation's metrics, metres."""
+
+    def pair(ade: str, fde: str) -> dict[str, float]:
+        return {"ade_m": metrics[ade]["value"], "fde_m": metrics[fde]["value"]}
+
+    return {
+        "mode_mean": pair("ade_mode", "fde_mode"),
+        "mean": pair("ade_mean", "fde_mean"),
+        "best_of": [
+            {
+                "n": n,
+                "per_agent": pair(f"min_ade_{n}", f"min_fde_{n}"),
+                "joint": pair(f"joint_ade_{n}", f"joint_fde_{n}"),
+            }
+            for n in BEST_OF
+            if f"min_ade_{n}" in metrics
+        ],
+    }
 
 
 def main() -> None:

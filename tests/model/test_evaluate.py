@@ -12,9 +12,10 @@ import pytest
 
 from trajectron_model.baselines.constant_velocity import ConstantVelocity
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
+from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
 from trajectron_model.evaluation import contenders, run
-from trajectron_model.evaluation.contenders import Contender, ContenderError, InSampleError
+from trajectron_model.evaluation.contenders import Contender, InSampleError
 from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
 from trajectron_model.evaluation.results import Estimate, Evaluation
 from trajectron_model.evaluation.run import Cancelled, Progress
@@ -70,7 +71,7 @@ def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
     """Gives names of entries to predictors of a test's own."""
 
     def names(**predictors: Predictor | Contender | Mapping[str, Predictor]) -> None:
-        def resolve(name: str, test_set: str) -> Contender:
+        def resolve(name: str, test_set: str, _: Sequence[Recording]) -> Contender:
             found = predictors[name]
             if isinstance(found, Mapping):
                 found = found[test_set]
@@ -205,10 +206,25 @@ def test_names_stand_for_baselines_and_bundled_models() -> None:
     assert family.predictor.name == "eth_ucy-without-hotel"
     assert family.sha256
     assert family.seen
-    with pytest.raises(ContenderError, match="not for street; name a model"):
-        contenders.resolve("leave-one-out", "street")
-    with pytest.raises(ValueError, match="nowhere: neither a bundled model"):
-        contenders.resolve("nowhere", "eth")
+    best = contenders.resolve("leave-one-out@z_best", "hotel")
+    assert best.predictor.name == "eth_ucy-without-hotel@z_best"
+    assert (best.sha256, best.seen) == (family.sha256, family.seen)
+
+
+@pytest.mark.parametrize(
+    ("name", "test_set", "reason"),
+    [
+        ("leave-one-out", "street", "not for street; name a model"),
+        ("leave-one-out@best", "eth", "the variants are z_best and stratified"),
+        ("linear@z_best", "eth", "baselines have no variants"),
+        ("paper-leaky", "street", "not on street"),
+        ("paper-leaky@z_best", "eth", "its variants are @seed-0"),
+        ("nowhere", "eth", "nowhere: neither a bundled model"),
+    ],
+)
+def test_names_that_stand_for_nothing_are_refused(name: str, test_set: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        contenders.resolve(name, test_set)
 
 
 # The fingerprint.

@@ -1,4 +1,8 @@
-"""From a name to what is judged under it: a bundled model, a checkpoint, a baseline."""
+"""From a name to what is judged under it: a bundled model, a checkpoint, a baseline.
+
+``NAME@VARIANT`` asks for the same model otherwise: ``@z_best`` forecasts its most probable mode
+alone, ``@stratified`` draws stratified samples, and ``paper-leaky@seed-2`` is of another training.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from trajectron_model import registry
-from trajectron_model.baselines.constant_velocity import ConstantVelocity
+from trajectron_model.baselines import registry as baselines
 from trajectron_model.data.eth_ucy import TEST_SETS
 from trajectron_model.data.recording import Recording
 from trajectron_model.predictor import Predictor, TrajectronPredictor
@@ -15,6 +19,11 @@ LEAVE_ONE_OUT = "leave-one-out"
 """On each test set of ETH/UCY, the bundled model that was trained without it."""
 
 FAMILY = "eth_ucy-without-{test_set}"
+
+PAPER_LEAKY = "paper-leaky"
+"""The paper's model under the paper's conditions, inputs that contain the future included."""
+
+Z_BEST, STRATIFIED = "z_best", "stratified"
 
 
 class ContenderError(ValueError):
@@ -82,37 +91,73 @@ class Contender:
         )
 
 
-def resolve(name: str, test_set: str) -> Contender:
+def resolve(name: str, test_set: str, recordings: Sequence[Recording] = ()) -> Contender:
     """What an entry of a plan stands for on a test set.
 
     Args:
-        name: ``leave-one-out``, a baseline (`baselines.NAMES`; the learned ones as trained
-            without the set), a bundled model, or the path of a checkpoint.
+        name: ``leave-one-out``, a baseline (`baselines.registry.NAMES`; the learned ones as
+            trained without the set), a bundled model, the path of a checkpoint, or
+            ``paper-leaky``; with a variant, as the module says.
         test_set: of ETH/UCY, or the name of a file's set, for which learned baselines are
             those trained on all recordings.
+        recordings: the set's; only ``paper-leaky`` looks at them, which is why it is fenced.
 
     Raises:
         ContenderError: no such thing, or not for this set.
         CheckpointError: a model that cannot be loaded.
     """
-    if name == LEAVE_ONE_OUT:
-        if test_set not in TEST_SETS:
-            raise ContenderError(
-                f"{LEAVE_ONE_OUT} has a model for each of {', '.join(TEST_SETS)}, "
-                f"not for {test_set}; name a model"
-            )
-        return _model(FAMILY.format(test_set=test_set))
-    if name == "constant-velocity":
-        return Contender(ConstantVelocity())
-    if name == "constant-velocity-noise":
-        return Contender(ConstantVelocity(heading_noise_deg=25.0))
-    return _model(name)
+    base, _, variant = name.partition("@")
+    if base == PAPER_LEAKY:
+        return _paper_leaky(test_set, recordings, variant)
+    if base in baselines.NAMES:
+        if variant:
+            raise ContenderError(f"{name}: baselines have no variants")
+        return _baseline(base, test_set if test_set in TEST_SETS else None)
+    if base != LEAVE_ONE_OUT:
+        return _model(base, variant)
+    if test_set not in TEST_SETS:
+        raise ContenderError(
+            f"{LEAVE_ONE_OUT} has a model for each of {', '.join(TEST_SETS)}, "
+            f"not for {test_set}; name a model"
+        )
+    return _model(FAMILY.format(test_set=test_set), variant)
 
 
-def _model(name: str) -> Contender:
+def _model(name: str, variant: str) -> Contender:
+    if variant not in ("", Z_BEST, STRATIFIED):
+        raise ContenderError(f"{name}@{variant}: the variants are {Z_BEST} and {STRATIFIED}")
     checkpoint = registry.load(name)
-    predictor = TrajectronPredictor(checkpoint.model, checkpoint.name)
+    predictor = TrajectronPredictor(
+        checkpoint.model,
+        f"{checkpoint.name}@{variant}" if variant else checkpoint.name,
+        mode="z_best" if variant == Z_BEST else "full",
+        sampling="stratified" if variant == STRATIFIED else "iid",
+    )
     return Contender.of_model(predictor, checkpoint.sha256, checkpoint.provenance)
+
+
+def _baseline(name: str, test_set: str | None) -> Contender:
+    predictor = baselines.baseline(name, test_set)
+    if name not in baselines.LEARNED:
+        return Contender(predictor)
+    sha256, provenance = baselines.sha256(name, test_set), baselines.provenance(name, test_set)
+    return Contender.of_model(predictor, sha256, provenance)
+
+
+def _paper_leaky(test_set: str, recordings: Sequence[Recording], variant: str) -> Contender:
+    if test_set not in TEST_SETS:
+        raise ContenderError(
+            f"{PAPER_LEAKY} reproduces the paper's table on {', '.join(TEST_SETS)} alone, "
+            f"not on {test_set}"
+        )
+    seed = variant.removeprefix("seed-") if variant else "0"
+    if not seed.isdecimal() or variant not in ("", f"seed-{seed}"):
+        raise ContenderError(f"{PAPER_LEAKY}@{variant}: its variants are @seed-0, @seed-1, ...")
+    # Imported here alone: nothing else of ours loads it, least of all what serves.
+    from trajectron_model.paper_leaky.predictor import bundled  # noqa: PLC0415
+
+    found = bundled(test_set, recordings, seed=int(seed))
+    return Contender.of_model(found.predictor, found.sha256, found.provenance)
 
 
 def _recordings_seen(provenance: Mapping[str, object]) -> tuple[Mapping[str, str], ...] | None:

@@ -175,7 +175,7 @@ def _shards(plan: EvaluationPlan, folder: Path, test_sets: Sequence[TestSet]) ->
     for test_set in test_sets:
         data = sets.fingerprint(test_set)
         for entry in plan.entries:
-            contender = contenders.resolve(entry, test_set.name)
+            contender = contenders.resolve(entry, test_set.name, test_set.recordings)
             if not plan.in_sample:
                 contender.refuse_in_sample(test_set.name, test_set.recordings)
             # What is in a shard's name is all that its scores depend on.
