@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -31,9 +31,9 @@ def environment() -> dict[str, str]:
 
 
 @contextmanager
-def serving(model: Path, folder: Path, **settings: str) -> Iterator[Served]:
+def serving(model: Path, folder: Path) -> Iterator[Served]:
     """A service with one model on free ports, ready; stopped by SIGTERM at the end."""
-    process, served = launch(model, folder, **settings)
+    process, served = launch(model, folder, {})
     try:
         yield served
         process.send_signal(signal.SIGTERM)
@@ -44,7 +44,7 @@ def serving(model: Path, folder: Path, **settings: str) -> Iterator[Served]:
 
 
 def launch(
-    model: Path, folder: Path, *, start_s: float = START_S, **settings: str
+    model: Path, folder: Path, settings: Mapping[str, str], start_s: float = START_S
 ) -> tuple[subprocess.Popen[bytes], Served]:
     """A service in a process that is the caller's to end, ready; its log is in the folder."""
     log = folder / LOG

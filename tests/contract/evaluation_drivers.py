@@ -183,14 +183,14 @@ def _view(message: pb.Evaluation) -> Json:
         "seconds_left": left.seconds + left.nanos * 1e-9 if timed else None,
     }
     progress.pop("time_left", None)
-    return (
-        {"start_time": None, "end_time": None, "max_windows": None}
-        | config
-        | seen
-        | {
-            "protocol": config["protocol"].removeprefix("EVALUATION_PROTOCOL_").lower(),
-            "state": seen["state"].removeprefix("EVALUATION_STATE_").lower(),
-            "seed": message.config.seed,
-            "progress": progress,
-        }
-    )
+    return {
+        "start_time": None,
+        "end_time": None,
+        "max_windows": None,
+        **config,
+        **seen,
+        "protocol": config["protocol"].removeprefix("EVALUATION_PROTOCOL_").lower(),
+        "state": seen["state"].removeprefix("EVALUATION_STATE_").lower(),
+        "seed": message.config.seed,
+        "progress": progress,
+    }

@@ -81,7 +81,7 @@ def test_killed_on_the_way_it_goes_on_and_gives_the_figures_of_an_offline_run(
     settings = {
         "state_dir": str(state), "evaluation_priority": "normal", "request_timeout_s": "600",
     }  # fmt: skip
-    process, served = launch(folder / "small", folder, start_s=PATIENCE_S, **settings)
+    process, served = launch(folder / "small", folder, settings, PATIENCE_S)
     try:
         create(served, folder, "walk")
         with HttpClient(served.http_url) as client:
@@ -98,7 +98,7 @@ def test_killed_on_the_way_it_goes_on_and_gives_the_figures_of_an_offline_run(
     done = {file: file.stat().st_mtime_ns for file in state.glob("evaluations/*/run/shards/*.npz")}
     assert done
 
-    process, served = launch(folder / "small", folder, start_s=PATIENCE_S, **settings)
+    process, served = launch(folder / "small", folder, settings, PATIENCE_S)
     try:
         with Client(served.grpc_target) as client:
             *_, last = client.watch_evaluation("walk", timeout_s=PATIENCE_S)

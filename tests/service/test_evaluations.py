@@ -300,10 +300,11 @@ def test_the_sets_of_a_data_set_are_all_unless_named(settings: Settings) -> None
 def test_a_served_model_is_judged_by_its_own_files(settings: Settings, tmp_path: Path) -> None:
     mine = {"mine": tmp_path / "mine", "eth_ucy": tmp_path / "eth_ucy"}
     choices = EvaluationChoices(settings, mine)
-    config = EvaluationConfig(models=("mine", "eth_ucy", "eth_ucy-without-eth"), dataset="eth_ucy")
+    names = ("mine@z_best", "mine", "eth_ucy", "eth_ucy-without-eth@stratified")
+    config = EvaluationConfig(models=names, dataset="eth_ucy")
     resolved = choices.resolve(config, ())
     # A path, for a bundled model of the same name would be taken instead.
-    assert choices.plan(resolved, ()).entries == ("mine", "./eth_ucy", "eth_ucy-without-eth")
+    assert choices.plan(resolved, ()).entries == (names[0], "mine", "./eth_ucy", names[3])
     assert choices.model_files(resolved) == mine
 
 

@@ -128,7 +128,8 @@ class Evaluations:
             if request_id and (fault := text_fault(request_id, "a request id")):
                 raise invalid("request_id", fault)
             resolved = self._choices.resolve(config, files)
-            sha256 = digest(wanted_id, resolved, files)
+            # Off the loop: a request may bring megabytes.
+            sha256 = await asyncio.to_thread(digest, wanted_id, resolved, files)
             blank = EvaluationInfo(
                 evaluation_id(wanted_id),
                 resolved,

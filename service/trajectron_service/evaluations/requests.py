@@ -12,9 +12,10 @@ from pathlib import Path
 import orjson
 
 from trajectron_model import registry
+from trajectron_model.baselines.registry import NAMES as BASELINES
 from trajectron_model.data.errors import DataError
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
-from trajectron_model.evaluation.contenders import LEAVE_ONE_OUT
+from trajectron_model.evaluation.contenders import LEAVE_ONE_OUT, STRATIFIED, Z_BEST
 from trajectron_model.evaluation.plan import EvaluationPlan
 from trajectron_service.errors import ErrorKind, FieldViolation, ServiceError, invalid
 from trajectron_service.evaluations.folders import MODEL_SUFFIXES, RECORDINGS
@@ -25,7 +26,8 @@ from trajectron_service.validation import quoted
 DATASET = "eth_ucy"
 """The one data set that a server knows, where it has been given its folder."""
 
-BASELINES = ("constant-velocity", "constant-velocity-noise")
+VARIANTS = (Z_BEST, STRATIFIED)
+"""Of a model, asked for as ``NAME@VARIANT``; baselines have none."""
 
 MAX_MODELS = 32
 MAX_FILES = 16
@@ -59,7 +61,7 @@ class EvaluationChoices:
 
     @property
     def models(self) -> tuple[str, ...]:
-        """Every name that can be judged."""
+        """Every name that can be judged, without variants."""
         names = (*self._served, *self._bundled, LEAVE_ONE_OUT, *BASELINES)
         return tuple(dict.fromkeys(names))
 
@@ -117,23 +119,28 @@ class EvaluationChoices:
         )
 
     def model_files(self, config: EvaluationConfig) -> dict[str, Path]:
-        """The models that have to lie beside the plan, as ``model_files`` of the constructor."""
-        return {name: self._served[name] for name in config.models if name in self._served}
+        """The models that have to lie beside the plan, as ``served`` of the constructor."""
+        bases = dict.fromkeys(name.partition("@")[0] for name in config.models)
+        return {base: self._served[base] for base in bases if base in self._served}
 
     def _entry(self, name: str) -> str:
         """A served model lies beside the plan; a bundled one of its name would win over it."""
-        return f"./{name}" if name in self._served and name in self._bundled else name
+        base = name.partition("@")[0]
+        return f"./{name}" if base in self._served and base in self._bundled else name
+
+    def _knows(self, name: str) -> bool:
+        base, at, variant = name.partition("@")
+        return base in self.models and (not at or (variant in VARIANTS and base not in BASELINES))
 
     def _check_models(self, models: Sequence[str]) -> None:
         if not 1 <= len(models) <= MAX_MODELS:
             raise invalid("models", f"has {len(models)} names; must be 1 to {MAX_MODELS}")
-        known = self.models
         for place, name in enumerate(models):
             field = f"models[{place}]"
             if name in models[:place]:
                 raise invalid(field, f"{quoted(name)} is also models[{models.index(name)}]")
-            if name not in known:
-                names = ", ".join(map(quoted, known))
+            if not self._knows(name):
+                names = ", ".join(map(quoted, self.models))
                 raise ServiceError(
                     ErrorKind.UNKNOWN_MODEL,
                     f"{field}: {quoted(name)} is unknown; this server has {names}",
@@ -207,9 +214,10 @@ def _sets_of_files(files: Sequence[RecordingFile]) -> tuple[str, ...]:
 def _check_family(models: Sequence[str], sets: Sequence[str]) -> None:
     """A family has no member for a recording that was sent along."""
     foreign = [name for name in sets if name not in TEST_SETS]
-    if LEAVE_ONE_OUT in models and foreign:
+    family = [place for place, name in enumerate(models) if name.startswith(LEAVE_ONE_OUT)]
+    if family and foreign:
         raise invalid(
-            f"models[{models.index(LEAVE_ONE_OUT)}]",
+            f"models[{family[0]}]",
             f"{LEAVE_ONE_OUT} has a model for each of {', '.join(TEST_SETS)}, none for "
             f"{foreign[0]}; name a model",
         )
