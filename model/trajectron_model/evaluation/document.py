@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Literal
+from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
 
@@ -24,6 +25,7 @@ from trajectron_model.checkpoint import write_atomically
 
 _TEMPLATE = "page.html.jinja"
 _FIGURES = "figures"
+_PLAIN = " /=:(),;.!-_*+?@$[]{}|^`~"  # needs no escape, neither in an address nor in HTML
 # Characters that neither XML nor a terminal should ever see.
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _MARKDOWN = re.compile(r"([\\`*_\[\]|~#$])")
@@ -106,9 +108,10 @@ class Picture:
 
     @property
     def data_uri(self) -> str:
-        """The whole figure as an address."""
-        media = {"svg": "image/svg+xml", "png": "image/png"}[self.kind]
-        return f"data:{media};base64,{base64.b64encode(self.content).decode('ascii')}"
+        """The whole figure as an address; drawings stay nearly as short as they are."""
+        if self.kind == "svg":
+            return f"data:image/svg+xml,{quote(self.content, safe=_PLAIN)}"
+        return f"data:image/png;base64,{base64.b64encode(self.content).decode('ascii')}"
 
 
 @dataclass(frozen=True)

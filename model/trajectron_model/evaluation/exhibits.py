@@ -1,7 +1,7 @@
 """The tables that an evaluation gives, and how entries, sets and metrics are called in them.
 
 Each takes an evaluation and gives a `Table`, or None where the evaluation has nothing to show of
-it. Entries in sample, and those that are fenced, are shown and never ranked.
+it. Entries in sample, fenced ones, and stratified samples are shown and never ranked.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ _ENTRIES = {
     "paper-leaky": "paper-leaky",
 }
 _FENCED = "paper-leaky"
+_STRATIFIED = "@stratified"
 _LONGEST_NAME = 48
 
 
@@ -68,8 +69,8 @@ class Metric(NamedTuple):
 
 
 def title_of(entry: str) -> str:
-    """How a report calls an entry; what follows a colon is a variant of it."""
-    family, _, variant = entry.partition(":")
+    """How a report calls an entry; what follows an @ is a variant of it."""
+    family, _, variant = entry.partition("@")
     if family not in _ENTRIES:
         return _short(entry)
     return f"{_ENTRIES[family]}, {_short(variant)}" if variant else _ENTRIES[family]
@@ -95,6 +96,11 @@ def has_spread(row: Row) -> bool:
 def fenced(row: Row) -> bool:
     """Whether a row has its inputs from the future: shown with a warning, never ranked."""
     return row.name.startswith(_FENCED)
+
+
+def ranked(row: Row) -> bool:
+    """Whether a row may be the best of a column: an honest one, of independent samples."""
+    return not (row.in_sample or fenced(row) or row.name.endswith(_STRATIFIED))
 
 
 def entry_styles(evaluations: Iterable[Evaluation]) -> dict[str, Style]:
@@ -183,13 +189,15 @@ def _table(
     caption: str,
     note: str,
 ) -> Table:
-    muted = frozenset(index for index, row in enumerate(rows) if row.in_sample or fenced(row))
-    ranked = [row for index, row in enumerate(rows) if index not in muted]
+    muted = frozenset(index for index, row in enumerate(rows) if not ranked(row))
+    compared = [row for row in rows if ranked(row)]
     cells: list[list[Cell]] = [[cell(row_title(row))] for row in rows]
     for title, scores_of in columns.items():
         metrics = metrics_of(title)
         best = {
-            metric.name: _best([estimate_of(scores_of(row), metric.name) for row in ranked], metric)
+            metric.name: _best(
+                [estimate_of(scores_of(row), metric.name) for row in compared], metric
+            )
             for metric in metrics
         }
         for line, row in zip(cells, rows, strict=True):
@@ -199,7 +207,7 @@ def _table(
                     _figure(
                         estimate_of(scores, metric.name),
                         metric,
-                        None if row.in_sample or fenced(row) else best[metric.name],
+                        best[metric.name] if ranked(row) else None,
                     )
                     for metric in metrics
                 )
@@ -287,7 +295,7 @@ def t_tests(
             for row in others
         ),
         "Marked: p below 0.05, two-tailed, paired over windows.",
-        frozenset(index for index, row in enumerate(others) if row.in_sample or fenced(row)),
+        frozenset(index for index, row in enumerate(others) if not ranked(row)),
     )
 
 

@@ -204,7 +204,8 @@ def best_of(evaluation: Evaluation, style: Mapping[str, Style]) -> Section:
             (
                 "Per agent, each agent picks its own best sample; joint, one sample index serves "
                 "all agents of the scene. These are different tasks: compare like with like. "
-                "Samples are independent; nothing is selected, clustered or stratified."
+                "Samples are independent and nothing is selected or clustered; a row of stratified "
+                "samples, where there is one, stands beside and is not ranked."
             ),
         ),
         _there(found),
@@ -393,7 +394,7 @@ def tests(evaluation: Evaluation) -> Section:
 
 def reference_of(evaluation: Evaluation) -> str | None:
     """The entry that the others are set against: the first with a model file; else the first."""
-    rows = [row for row in evaluation.rows if not row.in_sample and not exhibits.fenced(row)]
+    rows = [row for row in evaluation.rows if exhibits.ranked(row)]
     if len(evaluation.rows) < 2 or not rows:
         return None
     with_file = [row for row in rows if row.sets[0].model_sha256]
