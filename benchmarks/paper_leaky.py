@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
-from trajectron_model.paper_leaky import WARNING, weights
+from trajectron_model.paper_leaky import WARNING, saving
 from trajectron_model.paper_leaky.chunks import cut
 from trajectron_model.paper_leaky.forecasting import joint_best_of
 from trajectron_model.paper_leaky.inputs import prepare
@@ -84,7 +84,7 @@ def main() -> None:
 
 def judge(benchmark: EthUcy, name: str, path: Path, seed: int) -> Figures:
     """Both rows of the paper's table for one network, on all windows of its test set."""
-    network, description = weights.load(path)
+    network, description = saving.load(path)
     inputs = prepare(cut(benchmark.test(name), seed))
     full, z_best = (
         joint_best_of(network, inputs, samples=BEST_OF, seed=SAMPLING_SEED, z_best=z_best)

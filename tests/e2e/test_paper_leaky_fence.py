@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from trajectron_model.paper_leaky import NAME, weights
+from trajectron_model.paper_leaky import NAME, saving
 from trajectron_model.paper_leaky.network import LeakyNetwork
 from trajectron_service.cli import main
 
@@ -42,7 +42,7 @@ def test_its_files_are_no_checkpoint(
     capsys: pytest.CaptureFixture[str], crowd: Path, tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
-    weights.save(tmp_path / "leaky", LeakyNetwork(), {})
+    saving.save(tmp_path / "leaky", LeakyNetwork(), {})
     for command in (("serve",), ("predict", crowd)):
         said = refused(capsys, *command, "--model", tmp_path / "leaky.json")
         assert re.search(r"leaky\.json: not the JSON of a checkpoint", said)

@@ -18,7 +18,7 @@ from trajectron_model.data.windows import Window
 from trajectron_model.evaluation import protocols
 from trajectron_model.evaluation.plan import PlanError
 from trajectron_model.latent import categorical_kl
-from trajectron_model.paper_leaky import NAME, WARNING, weights
+from trajectron_model.paper_leaky import NAME, WARNING, saving
 from trajectron_model.paper_leaky.chunks import CHUNK_STEPS, ChunkSet, cut, kinematics
 from trajectron_model.paper_leaky.forecasting import joint_best_of, scenes
 from trajectron_model.paper_leaky.inputs import edge_mask, graph, prepare, slot_statistics
@@ -276,7 +276,7 @@ def test_a_few_steps_learn_a_simulated_crowd(tmp_path: Path) -> None:
     judged = prepare(cut(validation, settings.seed))
     again = joint_best_of(trained, judged, samples=5, seed=settings.seed)
     assert again == pytest.approx(min(validated, key=sum))
-    assert weights.load(tmp_path / "leaky")[1].provenance["warning"] == WARNING
+    assert saving.load(tmp_path / "leaky")[1].provenance["warning"] == WARNING
 
 
 def test_kl_of_equal_distributions_is_zero() -> None:
@@ -288,7 +288,7 @@ def test_kl_of_equal_distributions_is_zero() -> None:
 
 
 def test_no_registry_and_no_checkpoint_reader_takes_it(tmp_path: Path) -> None:
-    weights.save(tmp_path / "leaky", network(), {})
+    saving.save(tmp_path / "leaky", network(), {})
     assert not [name for name in registry.names() if "leaky" in name]
     with pytest.raises(CheckpointError, match="neither a bundled model"):
         registry.load(NAME)

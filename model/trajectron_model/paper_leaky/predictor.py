@@ -16,7 +16,7 @@ import torch
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
 from trajectron_model.evaluation.plan import PlanError
-from trajectron_model.paper_leaky import NAME, weights
+from trajectron_model.paper_leaky import NAME, saving
 from trajectron_model.paper_leaky.chunks import CHUNK_STEPS, cut
 from trajectron_model.paper_leaky.forecasting import Scene, encode, modes, sample
 from trajectron_model.paper_leaky.inputs import prepare
@@ -130,7 +130,7 @@ def bundled(test_set: str, recordings: Sequence[Recording], *, seed: int = 0) ->
     Raises:
         CheckpointError: none ships for this set and seed.
     """
-    network, description = weights.load(weights.bundled(test_set, seed))
+    network, description = saving.load(saving.bundled(test_set, seed))
     predictor = LeakyPredictor(network, recordings, slot_seed=seed)
     return Bundled(predictor, description.sha256, description.provenance)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from trajectron_model.data.recording import Recording
-from trajectron_model.paper_leaky import weights
+from trajectron_model.paper_leaky import saving
 from trajectron_model.paper_leaky.chunks import cut
 from trajectron_model.paper_leaky.forecasting import joint_best_of
 from trajectron_model.paper_leaky.inputs import Inputs, prepare
@@ -65,7 +65,7 @@ def train(
 
     Args:
         training, validation: recordings of one dt.
-        path: gets the weights and their description; see `weights`.
+        path: gets the weights and their description; see `saving`.
 
     Raises:
         ValueError: recordings without a chunk that is long enough to learn from.
@@ -99,8 +99,8 @@ def train(
                 facts["selected"] = {"step": step + 1, "best_of_n": errors}
         observe(Progress(step + 1, terms, errors))
     network.load_state_dict(chosen)
-    weights.save(path, network, facts)
-    return weights.load(path)[0]
+    saving.save(path, network, facts)
+    return saving.load(path)[0]
 
 
 def _draw(inputs: Inputs, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

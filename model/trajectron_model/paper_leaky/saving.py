@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trajectron_model.baselines import saving
+from trajectron_model.baselines import saving as baseline_files
 from trajectron_model.paper_leaky import NAME, WARNING
 from trajectron_model.paper_leaky.network import LeakyNetwork
 
@@ -22,24 +22,18 @@ def bundled(test_set: str, seed: int) -> Path:
     return _FOLDER / f"without-{test_set}-seed-{seed}"
 
 
-def seeds(test_set: str) -> tuple[int, ...]:
-    """The seeds of which a network trained without the test set ships."""
-    files = _FOLDER.glob(f"without-{test_set}-seed-*.json")
-    return tuple(sorted(int(file.stem.rsplit("-", 1)[1]) for file in files))
-
-
 def save(path: Path, network: LeakyNetwork, facts: Mapping[str, Any]) -> None:
     """Writes PATH.safetensors and PATH.json."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    saving.save(path, NAME, network, {"warning": WARNING, **facts})
+    baseline_files.save(path, NAME, network, {"warning": WARNING, **facts})
 
 
-def load(path: Path) -> tuple[LeakyNetwork, saving.Description]:
+def load(path: Path) -> tuple[LeakyNetwork, baseline_files.Description]:
     """A network ready to forecast, and its description.
 
     Raises:
         CheckpointError: missing, damaged or mismatched files.
     """
     network = LeakyNetwork()
-    description = saving.load(path, NAME, network)
+    description = baseline_files.load(path, NAME, network)
     return network, description
