@@ -10,7 +10,16 @@ from typing import Annotated
 
 import typer
 
-from trajectron_service.commands import evaluate, models, predict, replay, serve, simulate, train
+from trajectron_service.commands import (
+    evaluate,
+    models,
+    predict,
+    replay,
+    serve,
+    simulate,
+    train,
+    train_baseline,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -48,4 +57,5 @@ app.command()(replay.replay)
 app.command()(simulate.simulate)
 app.command()(models.models)
 app.command()(train.train)
+app.command()(train_baseline.train_baseline)
 app.command()(evaluate.evaluate)
