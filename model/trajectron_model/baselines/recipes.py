@@ -38,7 +38,7 @@ SETTINGS = {
     "lstm": BaselineSettings(windows=32, agents=6, jitter_m=0.03, minutes=2.0),
     "social-lstm": BaselineSettings(agents=12, jitter_m=0.03, minutes=4.0),
     "social-attention": BaselineSettings(agents=9, jitter_m=0.03, minutes=4.0),
-    "sgan": BaselineSettings(samples=VARIETY, minutes=5.0),
+    "sgan": BaselineSettings(agents=8, samples=VARIETY, minutes=5.0),
 }
 
 
