@@ -22,6 +22,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ from trajectron_model.encoders import EncoderState
 from trajectron_model.features import Kinematics, from_frame, to_frame
 from trajectron_model.gmm import choose
 from trajectron_model.integration import RandomWalk, integrate
-from trajectron_model.noise import SAMPLINGS, Sampling, agent_noise
+from trajectron_model.noise import SAMPLINGS, Sampling, scene_noise
 from trajectron_model.state import SceneState, stack
 
 if TYPE_CHECKING:
@@ -326,23 +327,8 @@ def _fill_samples(
     if not wanted:
         return
     device = agents.encoding.device
-    noise = []
-    for i in wanted:
-        request = requests[agents.keys[i][0]]
-        noise.append(
-            agent_noise(
-                request.seed,
-                agents.ids[i],
-                request.step,
-                request.samples,
-                horizon,
-                request.sampling,
-            )
-        )
-    counts = [n.latent.size for n in noise]
-    latent, turn, component, normal = (
-        torch.from_numpy(np.concatenate(column)).to(device) for column in zip(*noise, strict=True)
-    )
+    latent, turn, component, normal = _noise(wanted, agents, requests, horizon)
+    counts = [requests[agents.keys[i][0]].samples for i in wanted]
     best = [requests[agents.keys[i][0]].mode == "z_best" for i in wanted]
     repeats = torch.tensor(counts, device=device)
     agent = torch.tensor(wanted, device=device).repeat_interleave(repeats)  # [R]
@@ -362,6 +348,23 @@ def _fill_samples(
         assert result.samples is not None and result.sample_modes is not None
         result.samples[at] = values[last - count : last]
         result.sample_modes[at] = latents[last - count : last]
+
+
+def _noise(
+    wanted: Sequence[int], agents: _Agents, requests: Sequence[ForecastRequest], horizon: int
+) -> list[Tensor]:
+    """Latent [R], turn [R], component [R, H] and normal [R, H, 2] of all samples of agents."""
+    drawn = []
+    for number, rows in groupby(wanted, key=lambda i: agents.keys[i][0]):
+        asked, ids = requests[number], [agents.ids[i] for i in rows]
+        drawn.append(
+            scene_noise(asked.seed, ids, asked.step, asked.samples, horizon, asked.sampling)
+        )
+    columns = [
+        np.concatenate([part.reshape(-1, *part.shape[2:]) for part in column])  # [R, ...]
+        for column in zip(*drawn, strict=True)
+    ]
+    return [torch.from_numpy(column).to(agents.encoding.device) for column in columns]
 
 
 def _sample_offsets(
