@@ -98,6 +98,7 @@ def test_scores_are_those_computed_by_hand(stand: Stand, square: str, tmp_path: 
     assert found["fde_mode"] == pytest.approx(4.5)  # sample 0: 0 and 9
     assert found["ade_mode"] == pytest.approx(4.5 / 12)
     assert found["fde_mean"] == pytest.approx(4.2)  # of 4 and 4.4
+    assert found["fde_sample"] == pytest.approx(4.2)
     assert found["min_fde_1"] == found["joint_fde_1"] == pytest.approx(4.2)
     assert found["min_fde_5"] == pytest.approx(0.5)  # 0 and 1
     assert found["joint_fde_5"] == pytest.approx(3.0)  # 3 and 3
@@ -107,6 +108,45 @@ def test_scores_are_those_computed_by_hand(stand: Stand, square: str, tmp_path: 
     assert found["collision"] == 0.0
     assert "nll_mixture" not in found
     assert "min_fde_20" not in found  # five samples were drawn
+
+
+def test_best_of_n_is_over_the_agents_that_count(stand: Stand, tmp_path: Path) -> None:
+    """Under ``paper``: the second walker is not seen from t - 8 on, at the first t."""
+    file = tmp_path / "chunk.txt"
+    rows = [
+        f"{10 * step}\t{agent}\t{agent}.0\t1.0\n"
+        for step in range(29)
+        for agent in (1, 2)
+        if agent == 1 or step >= 7
+    ]
+    file.write_text("".join(rows))
+    stand(model=Drifting(MISSES_M))
+    evaluation = run.run(plan(str(file), protocol="paper", kde_samples=5), tmp_path / "work")
+    (of_set,) = evaluation.fingerprint.sets
+    assert (of_set.windows, of_set.agents, of_set.agents_in_best_of) == (2, 4, 3)
+    found = evaluation.rows[0].mean.metrics
+    assert (found["fde_sample"].agents, found["min_fde_5"].agents) == (4, 3)
+    assert found["fde_sample"].value == pytest.approx(4.2)
+    # Best of five: 0 for the first twice, 1 for the second once; jointly 0, and 3 and 3.
+    assert found["min_fde_5"].value == pytest.approx((0.0 + 0.0 + 1.0) / 3, abs=1e-6)
+    assert found["joint_fde_5"].value == pytest.approx((0.0 + 3.0 + 3.0) / 3)
+    assert "2 / 4 (best of N: 3)" in evaluation.to_markdown()
+
+
+def test_a_window_without_agents_for_best_of_n_has_other_scores(
+    stand: Stand, tmp_path: Path
+) -> None:
+    """One window, at t = 8, and one walker, seen from t - 1 on; another left at once."""
+    file = tmp_path / "chunk.txt"
+    rows = [f"{10 * step}\t1\t1.0\t1.0\n" for step in range(7, 28)]
+    file.write_text("".join(["0\t2\t5.0\t5.0\n", *rows]))
+    stand(model=Drifting([[2.0], [4.0]]))
+    asked = plan(str(file), protocol="paper", samples=2, kde_samples=2)
+    evaluation = run.run(asked, tmp_path / "work")
+    metrics = evaluation.rows[0].mean.metrics
+    assert metrics["fde_sample"] == Estimate(3.0, 3.0, 3.0, 1)
+    assert "min_fde_1" not in metrics
+    assert "1 / 1 (best of N: 0)" in evaluation.to_markdown()
 
 
 def test_horizon_steps_have_figures_of_their_own(stand: Stand, square: str, tmp_path: Path) -> None:
@@ -145,7 +185,7 @@ def test_paired_tests_compare_entries_over_the_same_windows(
     found = run.run(plan(square, entries=entries, samples=1), tmp_path / "work").comparisons
     # Of the same difference in every window there is no spread to test against.
     assert not [c for c in found if (c.first, c.second) == ("one", "other")]
-    assert {c.metric for c in found} <= {"ade_mean", "fde_mean", "min_ade_1", "min_fde_1"}
+    assert {c.metric for c in found} <= {"ade_mean", "fde_mean", "ade_sample", "fde_sample"}
 
 
 # In sample or not.

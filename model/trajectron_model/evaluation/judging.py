@@ -129,14 +129,17 @@ def _sample_columns(
     counts: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None,
     how: Judgement,
 ) -> dict[str, Float]:
-    """Best-of-N; only of agents that count, NaN for the others."""
-    agents = np.arange(len(truth)) if counts is None else np.flatnonzero(counts)
-    columns = {}
-    distance = metrics.displacement(samples[:, agents], truth[agents])  # [S, A', H]
+    """Errors of a sample on average, and best-of-N; the latter NaN for agents left out of it."""
+    distance = metrics.displacement(samples, truth)  # [S, A, H]
     errors = {
         "ade": metrics.average_displacement(distance),
         "fde": metrics.final_displacement(distance),
-    }  # [S, A']
+    }  # [S, A]
+    means = {f"{name}_sample": error.mean(axis=0) for name, error in errors.items()}
+    agents = np.arange(len(truth)) if counts is None else np.flatnonzero(counts)
+    errors = {name: error[:, agents] for name, error in errors.items()}  # [S, A']
+    distance = distance[:, agents]
+    columns = {}
     for n in how.best_of:
         for name, error in errors.items():
             columns[f"min_{name}_{n}"] = metrics.best_of(error, n)
@@ -146,7 +149,7 @@ def _sample_columns(
         flat = distance.reshape(len(samples), -1)  # [S, A' H]
         best = metrics.best_of(flat, BEST_AT_EACH_STEP)
         columns[f"min_distance_{BEST_AT_EACH_STEP}"] = best.reshape(distance.shape[1:])
-    return {name: _spread(column, agents, len(truth)) for name, column in columns.items()}
+    return means | {name: _spread(column, agents, len(truth)) for name, column in columns.items()}
 
 
 def _spread(

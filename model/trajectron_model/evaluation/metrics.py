@@ -129,8 +129,8 @@ def _groups(errors: Float, n: int) -> Float:
     samples, agents = errors.shape
     if not 1 <= n <= samples:
         raise ValueError(f"best of {n} needs at least {n} samples; there are {samples}")
-    whole = samples // n * n
-    return errors[:whole].reshape(-1, n, agents)  # [G, n, A]
+    groups = samples // n
+    return errors[: groups * n].reshape(groups, n, agents)  # [G, n, A]
 
 
 def sorted_slices(errors: Float, slices: int) -> Float:

@@ -10,7 +10,7 @@ Shape letters: A agents, W windows, B resamplings, C columns (a metric, or one o
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +33,48 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
+class Values:
+    """The scores of a set's agents as a table.
+
+    Attributes:
+        columns: what its columns are.
+        table: [A, C] NaN where a metric is not defined.
+        window: [A] rising index of each agent's window.
+        windows: W, in the set.
+    """
+
+    columns: tuple[Column, ...]
+    table: Float
+    window: NDArray[np.int64]
+    windows: int
+
+    @classmethod
+    def of(cls, scores: AgentScores, windows: int) -> Values:
+        """All metrics: their means over steps, and each step.
+
+        Args:
+            scores: of the set's agents.
+            windows: W, in the set.
+        """
+        columns: list[Column] = []
+        parts: list[Float] = []
+        for metric, values in sorted(scores.columns.items()):
+            columns.append(Column(metric, None))
+            if values.ndim == 1:
+                parts.append(values[:, None])
+                continue
+            columns += [Column(metric, step) for step in range(values.shape[1])]
+            parts += [mean_over_known(values)[:, None], values]
+        return cls(tuple(columns), np.concatenate(parts, axis=1), scores.window, windows)
+
+    def only(self, agents: NDArray[np.bool_], steps_of: Collection[str]) -> Values:
+        """Some agents [A]; horizon steps of these metrics only."""
+        kept = [n for n, c in enumerate(self.columns) if c.step is None or c.metric in steps_of]
+        columns = tuple(self.columns[n] for n in kept)
+        return Values(columns, self.table[agents][:, kept], self.window[agents], self.windows)
+
+
+@dataclass(frozen=True, eq=False)
 class Sample:
     """The mean of every column over a group of agents, and its resamplings.
 
@@ -47,24 +89,21 @@ class Sample:
     count: Float
 
     @classmethod
-    def of(
-        cls, scores: AgentScores, windows: int, resamplings: Float, chosen: NDArray[np.bool_]
-    ) -> Sample:
-        """The sample of some agents of a set.
+    def of(cls, values: Values, resamplings: Float) -> Sample:
+        """The sample of a table.
 
         Args:
-            scores: of the set's A agents.
-            windows: W, in the set.
+            values: of at least one agent.
             resamplings: [B, W] how often each window is drawn; see `resample`.
-            chosen: [A] which agents.
         """
-        columns, values = _flatten(scores)  # [A, C]
-        values, window = values[chosen], scores.window[chosen]
-        known = ~np.isnan(values)
-        total = _by_window(np.where(known, values, 0.0), window, windows)  # [W, C]
-        count = _by_window(known.astype(np.float64), window, windows)
-        weights = np.concatenate([np.ones((1, windows)), resamplings])  # [1 + B, W]
-        return cls(columns, weights @ total, weights @ count)
+        known = ~np.isnan(values.table)
+        weights = np.concatenate([np.ones((1, values.windows)), resamplings])  # [1 + B, W]
+        # Agents stand window by window, so every window that has any is a run of rows.
+        window, first = np.unique(values.window, return_index=True)
+        weights = weights[:, window]
+        total = np.add.reduceat(np.where(known, values.table, 0.0), first)  # [W', C]
+        count = np.add.reduceat(known.astype(np.float64), first)
+        return cls(values.columns, weights @ total, weights @ count)
 
     def scores(self) -> Scores:
         """Its means with their intervals."""
@@ -150,27 +189,6 @@ def paired_t_test(first: Float, second: Float) -> PairedTest | None:
     )
 
 
-def _flatten(scores: AgentScores) -> tuple[tuple[Column, ...], Float]:
-    """All metrics as columns [A, C]: the mean over steps first, then each step."""
-    names: list[Column] = []
-    parts: list[Float] = []
-    for metric, values in sorted(scores.columns.items()):
-        names.append(Column(metric, None))
-        if values.ndim == 1:
-            parts.append(values[:, None])
-            continue
-        names += [Column(metric, step) for step in range(values.shape[1])]
-        parts += [mean_over_known(values)[:, None], values]
-    return tuple(names), np.concatenate(parts, axis=1)
-
-
-def _by_window(values: Float, window: NDArray[np.int64], windows: int) -> Float:
-    """[A, C] rows summed into [W, C]."""
-    total = np.zeros((windows, values.shape[1]))
-    np.add.at(total, window, values)
-    return total
-
-
 def _common(samples: Sequence[Sample]) -> tuple[Column, ...]:
     """The columns that all samples have and that are defined for someone in each of them."""
     defined = [
@@ -189,8 +207,10 @@ def _pick(sample: Sample, columns: Sequence[Column]) -> Sample:
 def _scores(columns: Sequence[Column], means: Float, count: Float) -> Scores:
     """Estimates from means [1 + B, C] and counts of agents [C]."""
     defined = np.flatnonzero(count)
+    resampled = means[1:, defined]
     # A resampling can miss everyone whom a metric is defined for: it says nothing then.
-    low, high = np.nanpercentile(means[1:, defined], _INTERVAL, axis=0)
+    percentile = np.nanpercentile if np.isnan(resampled).any() else np.percentile
+    low, high = percentile(resampled, _INTERVAL, axis=0)
     found = {
         columns[index]: Estimate(
             _rounded(means[0, index]), _rounded(low[n]), _rounded(high[n]), int(count[index])

@@ -20,10 +20,10 @@ from trajectron_model.evaluation.results import (
 )
 from trajectron_model.evaluation.scores import AgentScores, Float
 from trajectron_model.evaluation.sets import TestSet
-from trajectron_model.evaluation.statistics import Sample
+from trajectron_model.evaluation.statistics import Sample, Values
 
 COMPARED = (
-    "ade_mean", "fde_mean", "min_ade_1", "min_fde_1", "min_ade_20", "min_fde_20",
+    "ade_mean", "fde_mean", "ade_sample", "fde_sample", "min_ade_20", "min_fde_20",
     "joint_ade_100", "joint_fde_100", "nll_kde",
 )  # fmt: skip
 """Metrics that entries are compared by, where both have them."""
@@ -33,6 +33,9 @@ AT_LEAST = (1, 2, 4, 8)
 
 FEW = (1, 2, 3)
 """Observations seen that are shown by themselves."""
+
+STEPS_IN_GROUPS = ("distance_mean", "distance_mode", "min_distance_20", "nll_kde", "nll_mixture")
+"""Metrics whose horizon steps are shown for groups of agents too."""
 
 _Key = tuple[str, str]  # what groups agents, and the group
 
@@ -70,11 +73,14 @@ def _row(
     samples: list[Sample] = []
     by_group: dict[_Key, list[Sample]] = {}
     for test_set in test_sets:
-        name, windows = test_set.name, len(test_set.windows)
+        name = test_set.name
         of, contender = scores[entry, name], contenders[entry, name]
-        every = np.ones(len(of.window), dtype=bool)
-        whole = Sample.of(of, windows, weights[name], every)
-        groups = {key: Sample.of(of, windows, weights[name], chosen) for key, chosen in _groups(of)}
+        values = Values.of(of, len(test_set.windows))
+        whole = Sample.of(values, weights[name])
+        groups = {
+            key: Sample.of(values.only(chosen, STEPS_IN_GROUPS), weights[name])
+            for key, chosen in _groups(of)
+        }
         samples.append(whole)
         for key, sample in groups.items():
             by_group.setdefault(key, []).append(sample)

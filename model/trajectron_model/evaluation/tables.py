@@ -96,12 +96,20 @@ def _counts(windows: int, agents: int, in_best_of: int) -> str:
 def _lines(row: Row) -> list[tuple[str, list[str]]]:
     """A row's lines: what the figures are called, and the figures of each set and their mean."""
     columns = [*(one.scores for one in row.sets), row.mean]
-    lines = [(label, [show(scores) for scores in columns]) for label, show in _FIGURES]
-    errors = [cells for label, cells in lines[: 3 + 2 * len(_BEST_OF)] if any(cells)]
-    if all(cells == errors[0] for cells in errors):
+
+    def lines(figures: Sequence[_Line]) -> list[tuple[str, list[str]]]:
+        shown = [(label, [show(scores) for scores in columns]) for label, show in figures]
+        return [(label, cells) for label, cells in shown if any(cells)]
+
+    errors, best = lines(_ERRORS), lines(_BEST)
+    if all(cells == errors[0][1] for _, cells in errors):
         # A predictor without spread: every error is that of its one trajectory.
-        lines = [("ADE/FDE, one trajectory", errors[0]), *lines[3 + 2 * len(_BEST_OF) :]]
-    return [(label, cells) for label, cells in lines if any(cells)]
+        errors = [("ADE/FDE, one trajectory", errors[0][1])]
+        if all(cells == best[0][1] for _, cells in best):
+            # Under ``paper`` best-of-N is over fewer agents, so it is another figure.
+            same = not best or best[0][1] == errors[0][1]
+            best = [] if same else [("ADE/FDE, best of any N", best[0][1])]
+    return [*errors, *best, *lines(_OTHERS)]
 
 
 def _pair(ade: str, fde: str) -> Callable[[Scores], str]:
@@ -122,15 +130,17 @@ def _several(metrics: Sequence[str], form: str, factor: float = 1.0) -> Callable
     return show
 
 
-_FIGURES: list[_Line] = [
+_ERRORS: list[_Line] = [
     ("ADE/FDE, most probable mode", _pair("ade_mode", "fde_mode")),
     ("ADE/FDE, mean of all modes", _pair("ade_mean", "fde_mean")),
-    ("ADE/FDE, one sample", _pair("min_ade_1", "min_fde_1")),
-    *(
-        (f"ADE/FDE, best of {n}, per {form}", _pair(f"{name}_ade_{n}", f"{name}_fde_{n}"))
-        for n in _BEST_OF
-        for form, name in (("agent", "min"), ("scene", "joint"))
-    ),
+    ("ADE/FDE, one sample", _pair("ade_sample", "fde_sample")),
+]
+_BEST: list[_Line] = [
+    (f"ADE/FDE, best of {n}, per {form}", _pair(f"{name}_ade_{n}", f"{name}_fde_{n}"))
+    for n in _BEST_OF
+    for form, name in (("agent", "min"), ("scene", "joint"))
+]
+_OTHERS: list[_Line] = [
     ("missed by 2 m, one / best of 20, %", _several(("miss_1", "miss_20"), ".1f", 100.0)),
     ("brier-minFDE of 5 modes", _several(("brier_fde",), ".3f")),
     ("energy score, m", _several(("energy",), ".3f")),
