@@ -100,7 +100,7 @@ class TrajectronPredictor:
     step, as a session's are by its version, so that windows of one agent do not share noise.
 
     Args:
-        model: as loaded from a checkpoint.
+        model: as loaded from a checkpoint; its weights stay as they are from then on.
         name: how tables call it.
         mode: ``z_best`` for forecasts of the most probable mode alone.
         sampling: see ``ForecastRequest``.

@@ -89,6 +89,59 @@ def test_a_model_and_constant_velocity_are_judged_side_by_side(
     assert json.loads(file.read_text()) == content
 
 
+def test_a_run_is_kept_and_goes_on_in_its_folder(
+    benchmark: Path, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work, table = tmp_path / "work", tmp_path / "result.csv"
+    arguments = ["--data", str(benchmark), "--sets", "street", "--model", model, "--samples", "5"]
+    arguments += ["--work", str(work), "--csv", str(table)]
+    assert run(*arguments) == 0
+    first = capsys.readouterr().out
+    shards = {file: file.stat().st_mtime_ns for file in (work / "shards").iterdir()}
+    assert run(*arguments) == 0
+    assert capsys.readouterr().out == first
+    assert {file: file.stat().st_mtime_ns for file in shards} == shards
+    lines = table.read_text().splitlines()
+    assert lines[0] == "entry,set,group,metric,step,value,low,high,agents"
+    assert any(line.startswith("constant-velocity,street,,ade_mean,,") for line in lines)
+    assert run(*arguments, "--seed", "9") == 2
+    assert "holds the work of another plan" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("protocol", ["all", "streaming", "paper"])
+def test_every_protocol_can_be_asked_for(
+    protocol: str, benchmark: Path, model: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--data", str(benchmark), "--sets", "street", "--model", model]
+    arguments += ["--protocol", protocol, "--samples", "5", "--kde-samples", "10"]
+    assert run(*arguments) == 0
+    printed = capsys.readouterr().out
+    assert f"Protocol {protocol}" in printed
+    assert "NLL a step, mixture" in printed
+
+
+def test_files_are_sets_of_their_own(
+    benchmark: Path, model: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(str(benchmark / "street.txt"), "--model", model, "--samples", "5") == 0
+    printed = capsys.readouterr().out
+    assert "street" in printed
+    assert "4 / 12" in printed
+    assert run(str(benchmark / "street.txt"), "--leave-one-out", "--samples", "5") == 2
+    assert "not for street; name a model" in capsys.readouterr().err
+
+
+def test_a_report_is_written(
+    benchmark: Path, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--data", str(benchmark), "--sets", "street", "--model", model]
+    assert run(*arguments, "--samples", "20", "--report", str(tmp_path / "report")) == 0
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "constant-velocity" in page or "constant velocity" in page
+    assert (tmp_path / "report" / "report.md").is_file()
+    capsys.readouterr()
+
+
 def test_a_model_is_judged_on_its_own_recordings_only_when_asked(
     benchmark: Path, model: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

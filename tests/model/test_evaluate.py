@@ -14,7 +14,7 @@ from trajectron_model.baselines.constant_velocity import ConstantVelocity
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
-from trajectron_model.evaluation import contenders, run
+from trajectron_model.evaluation import contenders, run, sets
 from trajectron_model.evaluation.contenders import Contender, InSampleError
 from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
 from trajectron_model.evaluation.results import Estimate, Evaluation
@@ -543,6 +543,17 @@ def test_an_unknown_set_is_refused(stand: Stand, eth_ucy: EthUcy, tmp_path: Path
 
 
 # Known results, on the real recordings.
+
+
+def test_shards_of_a_crowd_are_bounded(eth_ucy: EthUcy, tmp_path: Path) -> None:
+    """Univ with 2000 samples: a shard draws what fits in some hundred megabytes."""
+    asked = EvaluationPlan(("constant-velocity",), sets=("univ",), samples=2000)
+    (crowd,) = sets.load(asked, eth_ucy.folder)
+    largest = max(len(window.judged) for window in crowd.windows)
+    shards = run._shards(asked, tmp_path, [crowd])
+    assert sum(shard.agents for shard in shards) == crowd.agents == 24334
+    assert max(shard.agents for shard in shards) * 2000 <= max(largest * 2000, 100_000)
+    assert largest * 2000 * 12 * 2 * 8 < 60e6  # bytes of one window's samples as doubles
 
 
 def test_constant_velocity_has_its_known_errors(eth_ucy: EthUcy, tmp_path: Path) -> None:
