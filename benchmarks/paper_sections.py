@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from benchmarks import modes, published, runtime
+from benchmarks import modes, paper_noise, paper_runtime, published, runtime
 from benchmarks.published import Published
 from trajectron_model.data.recording import Recording
-from trajectron_model.evaluation import exhibits, figures, report
+from trajectron_model.evaluation import exhibits, report
 from trajectron_model.evaluation.contenders import STRATIFIED
 from trajectron_model.evaluation.document import (
     Cell,
@@ -22,7 +22,7 @@ from trajectron_model.evaluation.document import (
     cell,
 )
 from trajectron_model.evaluation.exhibits import Metric
-from trajectron_model.evaluation.figures import Curve, Style
+from trajectron_model.evaluation.figures import Style
 from trajectron_model.evaluation.pictures import AllScores
 from trajectron_model.evaluation.results import Evaluation, Row
 from trajectron_model.trajectron import Trajectron
@@ -35,17 +35,6 @@ _ABOUT = (
     "on the same windows with the same causal inputs. Small print gives 95% bootstrap intervals "
     "over windows; the best of each column is marked. Published rows, in italics, are as their "
     "authors report them and are not ranked."
-)
-_NOISE = (
-    "Gaussian noise on every observed coordinate of the protocol sgan; the truth stays clean. The "
-    "recordings are smooth splines, real trackers are not. A recording is jittered once: windows "
-    "that overlap see the same noise."
-)
-_TEN_HERTZ = (
-    "At 10 Hz a session that was told the interval keeps four interleaved chains of states, each "
-    "stepped every 0.4 s, and a forecast starts from the newest frame's chain. Where the noise is "
-    "independent from frame to frame, such a chain sees what is judged here: these figures are "
-    "those of 10 Hz as well."
 )
 _REPRODUCTION = (
     "The paper's model and training, under the paper's conditions, to see whether they give its "
@@ -94,12 +83,12 @@ def document(results: Results) -> Document:
         boxplots(results),
         table_1(results),
         likelihood(results),
-        table_2(results),
+        paper_runtime.section(results.timings),
         point_forecasts(results),
         best_of(results),
         report.calibration(_of_independent_samples(results), results.style),
         few_observations(results),
-        noise(results),
+        paper_noise.section(results.evaluations, results.style),
         behaviour(results),
         leaky(results),
         *(
@@ -135,15 +124,20 @@ def _warnings(results: Results) -> list[str]:
 
 def _facts(results: Results) -> dict[str, str]:
     found = {f"Missing: {exhibits.title_of(entry)}": why for entry, why in results.missing.items()}
+    jittered = paper_noise.by_jitter(results.evaluations)
     for name, of in results.evaluations.items():
         plan = of.fingerprint.plan
+        if plan.jitter_m:
+            continue  # the same windows as without
         sets = ", ".join(
             f"{exhibits.set_title(one.test_set)} {one.windows}/{one.agents}"
             for one in of.fingerprint.sets
         )
-        jitter = f", {100 * plan.jitter_m:g} cm of jitter" if plan.jitter_m else ""
-        found[name] = (
-            f"protocol {plan.protocol}{jitter}, {plan.samples} samples, seed {plan.seed}; "
+        title, noise = name, ""
+        if of in jittered.values():
+            title, noise = "jitter", f", noise of {', '.join(f'{cm:g}' for cm in jittered)} cm"
+        found[title] = (
+            f"protocol {plan.protocol}{noise}, {plan.samples} samples, seed {plan.seed}; "
             f"windows/agents: {sets}"
         )
     return found
@@ -158,7 +152,7 @@ def boxplots(results: Results) -> Section:
     ]
     found += [
         exhibits.t_tests(of, metric, f"{error} of one sample, m", reference=results.ours)
-        for metric, error in (("min_ade_1", "ADE"), ("min_fde_1", "FDE"))
+        for metric, error in (("ade_sample", "ADE"), ("fde_sample", "FDE"))
     ]
     drawn = of.fingerprint.plan.samples
     about = (
@@ -218,62 +212,6 @@ def likelihood(results: Results) -> Section:
     return Section("Likelihood of what came", (about,), _there(found))
 
 
-def table_2(results: Results) -> Section:
-    """The paper's Table 2: seconds for 200 samples of all agents of a scene."""
-    timings = results.timings
-    names = list(dict.fromkeys(name for one in timings for name in one.timings))
-    best = [
-        min((t.median_s for name, t in one.timings.items() if "gmm" not in name), default=None)
-        for one in timings
-    ]
-    rows: list[tuple[Cell, ...]] = [
-        (
-            cell(name),
-            *(
-                _timing(one.timings.get(name), least)
-                for one, least in zip(timings, best, strict=True)
-            ),
-        )
-        for name in names
-    ]
-    places = [_place(one.test_set) for one in timings]
-    muted = []
-    if None not in places:
-        for title, seconds in published.TABLE_2.items():
-            muted.append(len(rows))
-            rows.append(
-                (cell(title), *(cell(f"{seconds[p]:.2f}") for p in places if p is not None))
-            )
-    header = (
-        "",
-        *(f"{exhibits.set_title(one.test_set)}, {one.mean_agents:.1f} agents" for one in timings),
-    )
-    note = "Small print: least to largest of the repeats; ×: seconds over those of Social GAN in "
-    note += "one batched call, in the same repeat. Published rows are of another machine."
-    table = Table(
-        f"Seconds for {runtime.SAMPLES} samples of all agents in sight, {runtime.HORIZON} steps",
-        header,
-        tuple(rows),
-        note,
-        frozenset(muted),
-    )
-    about = (
-        f"One thread of {runtime.processor()}, all in the same run, in turn. Ours observes one "
-        "frame and forecasts, as it does in service, where the state of the scene is at hand; "
-        "Social GAN keeps no state and starts from 8 frames, as does our last row. The published "
-        "comparison is of 200 calls of one sample; one batched call is the rival to beat."
-    )
-    return Section("Table 2: runtime", (about,), (table,))
-
-
-def _timing(timing: runtime.Timing | None, least: float | None) -> Cell:
-    if timing is None:
-        return cell("–")
-    ratio = "" if timing.ratio is None else f", ×{timing.ratio:.2f}"
-    spread = f"{timing.low_s:.3g} to {timing.high_s:.3g}{ratio}"
-    return (Figure(f"{timing.median_s:.3g}", spread, best=timing.median_s == least),)
-
-
 def point_forecasts(results: Results) -> Section:
     """The protocol `sgan`, point forecasts in both forms."""
     of = _of_independent_samples(results)
@@ -321,79 +259,6 @@ def few_observations(results: Results) -> Section:
         "(re)appeared."
     )
     return Section("Few observations, protocol streaming", (about,), section.contents)
-
-
-def noise(results: Results) -> Section:
-    """Accuracy and coverage under jitter."""
-    jittered = {
-        100 * one.fingerprint.plan.jitter_m: one
-        for name, one in results.evaluations.items()
-        if name.startswith("jitter")
-    }
-    shown = {
-        "ADE of the mean over all modes, m": Metric("ade_mean", "ADE"),
-        "FDE of the mean over all modes, m": Metric("fde_mean", "FDE"),
-        "ADE of the best of 20, m": Metric("min_ade_20", "best of 20, ADE"),
-        "coverage of the 80% regions, %": Metric("coverage_80", "80% coverage", 1, 100.0, 0.8),
-    }
-    tables: list[Exhibit] = []
-    panels: dict[str, dict[str, Curve]] = {}
-    for title, metric in shown.items():
-        table = _by_jitter(jittered, metric, f"{title}, mean over sets, by jitter")
-        if table is None:
-            continue
-        tables.append(table)
-        panels[title] = _jitter_curves(jittered, metric)
-    pictures = [
-        _jitter_picture(name, title, panels[title], results.style)
-        for name, title in (
-            ("jitter-ade", "ADE of the mean over all modes, m"),
-            ("jitter-coverage", "coverage of the 80% regions, %"),
-        )
-        if panels.get(title)
-    ]
-    return Section("Noise", (_NOISE, _TEN_HERTZ), (*tables, *pictures))
-
-
-def _by_jitter(jittered: Mapping[float, Evaluation], metric: Metric, caption: str) -> Table | None:
-    """Entries by jitter: the columns of several evaluations side by side."""
-    columns: list[tuple[str, Table]] = []
-    for jitter_cm, of in jittered.items():
-        one = exhibits.by_metric(of, [metric], caption)
-        if one is None:
-            return None
-        columns.append((f"{jitter_cm:g} cm", one))
-    names = [row[0] for row in columns[0][1].rows]
-    if any([row[0] for row in table.rows] != names for _, table in columns):
-        raise ValueError("the evaluations under jitter have different entries")
-    rows = tuple(
-        (name, *(table.rows[place][1] for _, table in columns)) for place, name in enumerate(names)
-    )
-    return Table(caption, ("", *(title for title, _ in columns)), rows, "", columns[0][1].muted)
-
-
-def _jitter_curves(jittered: Mapping[float, Evaluation], metric: Metric) -> dict[str, Curve]:
-    found: dict[str, list[tuple[float, float, float, float]]] = {}
-    for jitter_cm, of in jittered.items():
-        for row in of.rows:
-            one = row.mean.metrics.get(metric.name)
-            if one is not None and (metric.target is None or exhibits.has_spread(row)):
-                value, low, high = (metric.factor * v for v in (one.value, one.low, one.high))
-                found.setdefault(exhibits.title_of(row.name), []).append(
-                    (jitter_cm, value, low, high)
-                )
-    return {name: Curve(*np.array(points).T) for name, points in found.items()}
-
-
-def _jitter_picture(
-    name: str, title: str, found: Mapping[str, Curve], style: Mapping[str, Style]
-) -> Picture:
-    ticks = sorted({float(x) for curve in found.values() for x in np.atleast_1d(curve.x)})
-    drawn = figures.curves(
-        {exhibits.MEAN: found}, style, label=title, below="jitter, cm", ticks=ticks
-    )
-    caption = f"{title[0].upper()}{title[1:]} by jitter, mean over sets, with 95% bands."
-    return Picture(name, caption, figures.svg(drawn).encode())
 
 
 def behaviour(results: Results) -> Section:
@@ -459,7 +324,7 @@ def _spread(rows: Sequence[Row], n: int) -> str:
 
 def beside(table: Table, rows: Sequence[Published], sets: Sequence[str]) -> Table:
     """The table with published rows below, muted; of the sets that are its columns."""
-    places = [_place(one) for one in sets]
+    places = [published.place(one) for one in sets]
     if all(place is None for place in places):
         return table
     whole = tuple(sets) == published.SETS
@@ -473,10 +338,6 @@ def beside(table: Table, rows: Sequence[Published], sets: Sequence[str]) -> Tabl
     return Table(
         table.caption, table.header, (*table.rows, *added), table.note, table.muted | set(muted)
     )
-
-
-def _place(test_set: str) -> int | None:
-    return published.SETS.index(test_set) if test_set in published.SETS else None
 
 
 def _pair(pair: published.Pair) -> Cell:

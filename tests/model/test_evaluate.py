@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from trajectron_model.baselines.constant_velocity import ConstantVelocity
+from trajectron_model.config import ModelConfig
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
@@ -19,7 +21,8 @@ from trajectron_model.evaluation.contenders import Contender, InSampleError
 from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
 from trajectron_model.evaluation.results import Estimate, Evaluation
 from trajectron_model.evaluation.run import Cancelled, Progress
-from trajectron_model.predictor import Predictor, WindowForecast
+from trajectron_model.predictor import Predictor, TrajectronPredictor, WindowForecast
+from trajectron_model.trajectron import Trajectron
 
 STEPS = 23  # four windows of the protocol sgan
 
@@ -378,6 +381,40 @@ def test_figures_do_not_depend_on_how_the_work_is_cut(
     assert run.run(asked, tmp_path / "cut") == whole
     assert len(list((tmp_path / "whole" / "shards").iterdir())) == 1
     assert len(list((tmp_path / "cut" / "shards").iterdir())) == 4
+
+
+def test_the_model_too_scores_the_same_however_its_work_is_cut(
+    stand: Stand, walkers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(7)
+    small = ModelConfig(decoder_size=16, latent_values=4, mixture_components=3)
+    model = Trajectron(small).eval()
+    asked = plan(walkers, samples=20, protocol="streaming")
+
+    def scores(folder: str) -> Mapping[str, np.ndarray]:
+        stand(model=TrajectronPredictor(model, "small"))
+        run.run(asked, tmp_path / folder)
+        return run.load_scores(asked, tmp_path / folder)["model", "walkers"].columns
+
+    whole = scores("whole")
+    monkeypatch.setattr(run, "_TRAJECTORIES", 300)
+    cut = scores("cut")
+    assert len(list((tmp_path / "cut" / "shards").iterdir())) > 3
+    assert {"nll_exact", "nll_mixture", "nll_kde", "brier_fde"} < whole.keys()
+    for name, column in whole.items():
+        if name.startswith("coverage"):  # of few draws: one may fall on the other side
+            assert np.nanmean(abs(cut[name] - column)) < 0.01
+            np.testing.assert_array_equal(np.isnan(cut[name]), np.isnan(column))
+        else:
+            np.testing.assert_allclose(cut[name], column, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+def test_a_forecast_that_is_not_finite_is_refused(
+    stand: Stand, square: str, tmp_path: Path
+) -> None:
+    stand(model=Drifting([[np.nan, 0.0]]))
+    with pytest.raises(ValueError, match="drifting forecast positions that are not finite"):
+        run.run(plan(square, samples=1), tmp_path / "work")
 
 
 def test_the_seed_chooses_samples_and_nothing_else(

@@ -67,6 +67,8 @@ def judge(
         first: index of the first window among those of its set.
     """
     forecasts = predictor.predict(windows, num_samples=how.drawn, seed=how.seed)
+    for window, forecast in zip(windows, forecasts, strict=True):
+        _check(predictor, window, forecast, how)
     exact: Sequence[Float | None] = [None] * len(windows)
     if isinstance(predictor, DensityPredictor):
         exact = predictor.log_prob(windows)
@@ -84,8 +86,9 @@ def _scores(
     index: int, window: Window, forecast: WindowForecast, log_prob: Float | None, how: Judgement
 ) -> AgentScores:
     truth = window.future()
+    distance = metrics.displacement(forecast.samples, truth)  # [S, A, H]
     columns = _point_columns(forecast, truth)
-    columns |= _sample_columns(forecast.samples[: how.samples], truth, window.in_best_of, how)
+    columns |= _sample_columns(distance[: how.samples], window.in_best_of, how)
     columns |= _density_columns(window, forecast, truth, how)
     paired = forecast.samples[: min(how.samples, PAIRED_SAMPLES)]
     columns["energy"] = metrics.energy_score(paired, truth)
@@ -98,15 +101,25 @@ def _scores(
         type=np.array(window.types, dtype=np.str_),
         observations=window.observations(),
         columns=columns,
-        sample_errors=_sample_errors(forecast.samples, truth),
+        sample_errors=_sample_errors(distance),
     )
 
 
-def _sample_errors(
-    samples: np.ndarray[tuple[int, ...], np.dtype[np.floating]], truth: Float
-) -> dict[str, Float]:
+def _check(predictor: Predictor, window: Window, forecast: WindowForecast, how: Judgement) -> None:
+    """Raises ValueError for a forecast that would be averaged without a word."""
+    shape = (how.drawn, len(window.judged), window.horizon, 2)
+    if forecast.samples.shape != shape:
+        raise ValueError(f"{predictor.name} gave samples of shape {forecast.samples.shape}")
+    positions = (forecast.samples, forecast.mode_mean, forecast.mean)
+    if not all(np.isfinite(one).all() for one in positions):
+        raise ValueError(
+            f"{predictor.name} forecast positions that are not finite from step {window.now} of "
+            f"{window.recording.name}"
+        )
+
+
+def _sample_errors(distance: Float) -> dict[str, Float]:
     """See `AgentScores.sample_errors`: of all judged agents and of every sample drawn."""
-    distance = metrics.displacement(samples, truth)  # [S, A, H]
     return {
         "ade": metrics.sorted_slices(metrics.average_displacement(distance), ERROR_SLICES),
         "fde": metrics.sorted_slices(metrics.final_displacement(distance), ERROR_SLICES),
@@ -124,19 +137,24 @@ def _point_columns(forecast: WindowForecast, truth: Float) -> dict[str, Float]:
 
 
 def _sample_columns(
-    samples: np.ndarray[tuple[int, ...], np.dtype[np.floating]],
-    truth: Float,
+    distance: Float,
     counts: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None,
     how: Judgement,
 ) -> dict[str, Float]:
-    """Errors of a sample on average, and best-of-N; the latter NaN for agents left out of it."""
-    distance = metrics.displacement(samples, truth)  # [S, A, H]
+    """Errors of a sample on average, and best-of-N; the latter NaN for agents left out of it.
+
+    Args:
+        distance: [S, A, H] of the samples from the truth.
+        counts: [A] who counts in best-of-N; None for all.
+        how: see `Judgement`.
+    """
+    total = distance.shape[1]
     errors = {
         "ade": metrics.average_displacement(distance),
         "fde": metrics.final_displacement(distance),
     }  # [S, A]
     means = {f"{name}_sample": error.mean(axis=0) for name, error in errors.items()}
-    agents = np.arange(len(truth)) if counts is None else np.flatnonzero(counts)
+    agents = np.arange(total) if counts is None else np.flatnonzero(counts)
     errors = {name: error[:, agents] for name, error in errors.items()}  # [S, A']
     distance = distance[:, agents]
     columns = {}
@@ -146,10 +164,10 @@ def _sample_columns(
             columns[f"joint_{name}_{n}"] = metrics.joint_best_of(error, n)
         columns[f"miss_{n}"] = metrics.miss_rate(errors["fde"], n)
     if how.samples >= BEST_AT_EACH_STEP:
-        flat = distance.reshape(len(samples), -1)  # [S, A' H]
+        flat = distance.reshape(len(distance), -1)  # [S, A' H]
         best = metrics.best_of(flat, BEST_AT_EACH_STEP)
         columns[f"min_distance_{BEST_AT_EACH_STEP}"] = best.reshape(distance.shape[1:])
-    return means | {name: _spread(column, agents, len(truth)) for name, column in columns.items()}
+    return means | {name: _spread(column, agents, total) for name, column in columns.items()}
 
 
 def _spread(

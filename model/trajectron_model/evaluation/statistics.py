@@ -124,7 +124,9 @@ def mean_of_sets(samples: Sequence[Sample]) -> Scores:
     columns = _common(samples)
     picked = [_pick(sample, columns) for sample in samples]
     with np.errstate(invalid="ignore", divide="ignore"):
-        means = np.mean([sample.total / sample.count for sample in picked], axis=0)
+        each = np.stack([sample.total / sample.count for sample in picked])  # [sets, 1 + B, C]
+    # A resampling that has nobody of a set's group says nothing of that set.
+    means = mean_over_known(each, axis=0)
     return _scores(columns, means, np.sum([sample.count[0] for sample in picked], axis=0))
 
 
