@@ -24,7 +24,7 @@ from trajectron_model.predictor import PositionMixture, TrajectronPredictor
 from trajectron_model.trajectron import Trajectron
 
 _CONTRASTS = (0.0, 0.5, 1.0, 1.5, 2.0)
-_HALVINGS = 8
+_HALVINGS = 7
 _WIDEST = 4.0
 _MIN_AGENTS = 50
 _SEED = 20191027

@@ -21,7 +21,7 @@ from trajectron_model.trajectron import Trajectron
 _SAMPLES = 20
 _SEED = 20191027
 _LOSS_BATCHES = 4
-_CALIBRATION_AGENTS = 400
+_CALIBRATION_AGENTS = 200
 
 
 class ValidationFigures(NamedTuple):
