@@ -226,7 +226,7 @@ def start_velocity(model: Trajectron, motion: Kinematics, kind: int) -> Tensor:
     return torch.where(motion.heading_known.unsqueeze(-1), velocity, 0.0)
 
 
-def _turned(model: Trajectron, motion: Kinematics) -> Tensor:
+def without_direction(model: Trajectron, motion: Kinematics) -> Tensor:
     """[N] whether the agent's forecast has no direction of its own."""
     if model.features.isotropic_without_heading:
         return ~motion.heading_known
@@ -293,7 +293,7 @@ def mode_moments(
     covariance = covariance.reshape(nodes, values, horizon, 3) + floor
     covariance = disperse(covariance, log_prior, agent_type.dispersion)
     axis = model.features.frame(motion)[:, None, None, :]
-    turned = _turned(model, motion)[:, None, None, None]
+    turned = without_direction(model, motion)[:, None, None, None]
     square = mean.square().sum(-1) + covariance[..., 0] + covariance[..., 2]
     round_ = torch.stack([0.5 * square, torch.zeros_like(square), 0.5 * square], dim=-1)
     covariance = torch.where(turned, round_, _rotate(covariance, axis))
@@ -386,6 +386,6 @@ def _sample_offsets(
     angle = turn * (2.0 * math.pi)
     any_axis = torch.stack([angle.cos(), angle.sin()], dim=-1)
     axis = model.features.frame(agents.motion)[agent]
-    axis = torch.where(_turned(model, agents.motion)[agent].unsqueeze(-1), any_axis, axis)
+    axis = torch.where(without_direction(model, agents.motion)[agent].unsqueeze(-1), any_axis, axis)
     offsets = integrate(sampled, model.config.dt_s) * agent_type.speed_scale_mps
     return from_frame(offsets, axis.unsqueeze(1))

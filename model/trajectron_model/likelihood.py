@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trajectron_model.features import Kinematics, to_frame
-from trajectron_model.forecast import start_velocity
+from trajectron_model.forecast import start_velocity, without_direction
 from trajectron_model.history import gather
 from trajectron_model.node_model import Likelihood
 from trajectron_model.state import SceneState, stack
@@ -142,14 +142,12 @@ def _frames(model: Trajectron, motion: Kinematics, rows: Tensor) -> Iterator[tup
     Within a run every agent has equally many frames, one after the other.
     """
     axis = model.features.frame(motion)
-    known = motion.heading_known[rows]
-    if not model.features.isotropic_without_heading:
-        known = torch.ones_like(known)
-    for part in _runs(rows[known], _ROWS):
+    turned = without_direction(model, motion)[rows]
+    for part in _runs(rows[~turned], _ROWS):
         yield part, axis[part]
     angle = torch.arange(ANGLES, device=rows.device) * (2.0 * math.pi / ANGLES)
     turns = torch.stack([angle.cos(), angle.sin()], dim=-1)  # [ANGLES, 2]
-    for part in _runs(rows[~known], _ROWS // ANGLES):
+    for part in _runs(rows[turned], _ROWS // ANGLES):
         yield part.repeat_interleave(ANGLES), turns.repeat(len(part), 1)
 
 
