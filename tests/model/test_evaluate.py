@@ -254,6 +254,13 @@ def test_names_stand_for_baselines_and_bundled_models() -> None:
     assert (best.sha256, best.seen) == (family.sha256, family.seen)
 
 
+def test_a_learned_baseline_is_the_one_trained_without_the_set(eth_ucy: EthUcy) -> None:
+    kalman = contenders.resolve("kalman", "eth")
+    assert kalman.sha256
+    assert kalman.seen_of(eth_ucy.test("eth")) == ()
+    assert kalman.seen_of(eth_ucy.test("hotel")) == ("biwi_hotel",)
+
+
 @pytest.mark.parametrize(
     ("name", "test_set", "reason"),
     [
