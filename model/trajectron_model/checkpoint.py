@@ -34,15 +34,21 @@ class Description:
 
     Attributes:
         name: the files' name without suffix; of a folder's ``model``, the folder's name.
-        sha256: of the weights' file, hexadecimal.
+        weights_sha256: of the weights' file, hexadecimal.
         config: of the model.
         provenance: task, data, split, seed, metrics, licence note, as JSON values.
     """
 
     name: str
-    sha256: str
+    weights_sha256: str
     config: ModelConfig
     provenance: Mapping[str, Any]
+
+    @property
+    def sha256(self) -> str:
+        """Of all that forecasts follow from, hexadecimal: the weights and the configuration."""
+        settings = json.dumps(self.config.to_json(), sort_keys=True)
+        return hashlib.sha256((self.weights_sha256 + settings).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,7 @@ class Checkpoint:
         description = describe(stem)
         file = _with_suffix(stem, ".safetensors")
         content = _read(file)
-        if hashlib.sha256(content).hexdigest() != description.sha256:
+        if hashlib.sha256(content).hexdigest() != description.weights_sha256:
             raise CheckpointError(
                 f"{file}: its sha256 is not the one that {stem.name}.json names: the file is "
                 "damaged, truncated or of another model"
@@ -116,7 +122,7 @@ def describe(path: str | Path) -> Description:
             raise CheckpointError(f"{file}: format {values['format']}, expected {FORMAT}")
         return Description(
             name=_name(stem),
-            sha256=str(values["sha256"]),
+            weights_sha256=str(values["sha256"]),
             config=ModelConfig.from_json(values["model"]),
             provenance=dict(values["provenance"]),
         )

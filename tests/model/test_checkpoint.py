@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import torch
 
 from trajectron_model import registry
 from trajectron_model.checkpoint import Checkpoint, CheckpointError, describe, save
-from trajectron_model.config import EdgeRadius, ModelConfig, NodeType
+from trajectron_model.config import Dispersion, EdgeRadius, ModelConfig, NodeType
 from trajectron_model.forecast import ForecastRequest
 from trajectron_model.state import SceneFrame
 from trajectron_model.trajectron import Trajectron
@@ -225,3 +226,15 @@ def test_bundled_models_are_small_complete_and_describe_themselves() -> None:
 def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
     with pytest.raises(CheckpointError, match=r"nothing: neither a bundled model .*eth_ucy"):
         registry.load("nothing")
+
+
+def test_the_hash_names_the_configuration_too(tmp_path: Path) -> None:
+    # Forecasts follow from both: calibrated anew, a model is another model.
+    model = Trajectron(ModelConfig())
+    save(tmp_path / "a", model, {})
+    calibrated = (NodeType("pedestrian", dispersion=(Dispersion(0.5, 0.0),)),)
+    model.config = replace(model.config, types=calibrated)
+    save(tmp_path / "b", model, {})
+    first, second = describe(tmp_path / "a"), describe(tmp_path / "b")
+    assert first.weights_sha256 == second.weights_sha256
+    assert first.sha256 != second.sha256
