@@ -73,7 +73,9 @@ def test_a_group_in_few_windows_has_an_interval_all_the_same() -> None:
 
 
 def test_some_agents_and_some_metrics_steps_can_be_had_alone() -> None:
-    whole = scores([0, 1, 1], distance=[[1.0, 3.0]] * 3, area=[[1.0, 1.0]] * 3, error=[1.0, 2.0, 6.0])
+    whole = scores(
+        [0, 1, 1], distance=[[1.0, 3.0]] * 3, area=[[1.0, 1.0]] * 3, error=[1.0, 2.0, 6.0]
+    )
     some = Values.of(whole, 2).only(np.array([True, False, True]), ("distance",))
     found = Sample.of(some, statistics.resample(2, 100, 0, "set")).scores()
     assert found.metrics["error"].value == 3.5
