@@ -51,6 +51,7 @@ JITTERS_M = (0.02, 0.05, 0.10)
 SCENES, REPEATS = 12, 5  # of each set, in the table of runtimes
 _QUICK_SCENES, _QUICK_REPEATS = 2, 1
 _MOST_SEEDS = 100
+_ROOT = Path(__file__).parents[1].resolve()
 _JITTERED = ("sgan", "kalman", "constant-velocity-noise", "constant-velocity")
 
 
@@ -181,7 +182,7 @@ def available(
             for name, of in recordings.items():
                 contenders.resolve(entry, name, of)
         except ValueError as error:  # a ContenderError or a CheckpointError, by their base
-            missing[entry] = str(error)
+            missing[entry] = str(error).replace(f"{_ROOT}{os.sep}", "")
         else:
             kept.append(entry)
     return replace(plan, entries=tuple(kept))

@@ -10,6 +10,12 @@ from typing import NamedTuple
 
 SETS = ("eth", "hotel", "univ", "zara1", "zara2")
 
+
+def place(test_set: str) -> int | None:
+    """Where a set stands in every published row; None for a set of one's own."""
+    return SETS.index(test_set) if test_set in SETS else None
+
+
 Pair = tuple[float, float] | None
 
 

@@ -128,7 +128,7 @@ def test_the_page_needs_nothing_but_itself() -> None:
     assert all(one.startswith(("data:", "#")) for one in page.addresses)
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
     outside = re.compile(r"url\(\s*['\"]?(?!#)|@import|https?://")
-    assert not outside.search(text)
+    assert not outside.search(re.sub(r'src="data:[^"]*"', "", text))
     for drawing in pictures_of(page):
         ET.fromstring(drawing)  # well-formed
         without_names = re.sub(r'xmlns(:\w+)?="[^"]*"', "", drawing)
@@ -200,7 +200,7 @@ def test_t_tests_are_set_against_the_reference_whichever_way_they_were_made() ->
     backward = exhibits.t_tests(TWO, "ade_mean", "ADE", reference="sgan")
     assert forward is not None and backward is not None
     assert forward.rows[0][1] == (Figure("\N{MINUS SIGN}0.250", "p = 0.004", best=True),)
-    assert backward.rows[0][1][0].text == "+0.250"
+    assert backward.rows[0][1][0] == Figure("+0.250", "p = 0.004")
     assert backward.rows[0][0] == cell("Trajectron")
 
 

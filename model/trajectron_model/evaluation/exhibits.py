@@ -282,7 +282,11 @@ def t_tests(
         other, sign = (one.second, 1.0) if one.first == reference else (one.first, -1.0)
         difference = f"{sign * one.difference:+.{places}f}".replace("-", "\N{MINUS SIGN}")
         found[other, one.test_set] = (
-            Figure(difference, f"p {_probability(one.p)}", best=one.p < 0.05),
+            Figure(
+                difference,
+                f"p {_probability(one.p)}",
+                best=one.p < 0.05 and sign * one.difference < 0.0,
+            ),
         )
     others = [row for row in evaluation.rows if any(key[0] == row.name for key in found)]
     if not others:
@@ -294,7 +298,7 @@ def t_tests(
             (cell(row_title(row)), *(found.get((row.name, one), cell("–")) for one in columns))
             for row in others
         ),
-        "Marked: p below 0.05, two-tailed, paired over windows.",
+        "Two-tailed, paired over windows. Marked: in its favour with p below 0.05.",
         frozenset(index for index, row in enumerate(others) if not ranked(row)),
     )
 

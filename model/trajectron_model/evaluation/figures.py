@@ -123,6 +123,8 @@ def boxplots(
 ) -> Figure:
     """Boxes of the entries with a distribution, one panel a set; the others are lines.
 
+    Each panel has an axis of its own: what compares is within a set.
+
     Args:
         panels: by set, then by entry.
         lines: the means of entries with a single trajectory, by set, then by entry.
@@ -132,7 +134,9 @@ def boxplots(
     with look():
         boxed = list(dict.fromkeys(name for boxes in panels.values() for name in boxes))
         flat = list(dict.fromkeys(name for found in lines.values() for name in found))
-        figure, axes = _panels(list(panels), label, width_in=max(1.3, 0.28 * len(boxed) + 0.6))
+        figure, axes = _panels(
+            list(panels), label, width_in=max(1.45, 0.26 * len(boxed) + 0.75), shared=False
+        )
         for one, (panel, boxes) in zip(axes, panels.items(), strict=True):
             for name, height in lines.get(panel, {}).items():
                 one.axhline(
@@ -234,9 +238,10 @@ def curves(
     ticks: Sequence[float] | None = None,
     tick_labels: Sequence[str] | None = None,
     zero: bool = True,
+    shared: bool = True,
     references: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """Lines with 95% bands, one panel a set, all with one vertical axis.
+    """Lines with 95% bands, one panel a set.
 
     Args:
         panels: by set, then by entry.
@@ -246,11 +251,12 @@ def curves(
         ticks: of the horizontal axis.
         tick_labels: of these; None for the numbers.
         zero: whether the vertical axis begins at zero.
+        shared: whether all panels have the same vertical axis.
         references: heights of thin lines behind the curves, by panel.
     """
     with look():
         names = list(dict.fromkeys(name for found in panels.values() for name in found))
-        figure, axes = _panels(list(panels), label)
+        figure, axes = _panels(list(panels), label, shared=shared)
         for one, (panel, found) in zip(axes, panels.items(), strict=True):
             for height in (references or {}).get(panel, ()):
                 one.axhline(height, color=_FAINT, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
@@ -347,14 +353,14 @@ def blank(width_in: float, height_in: float) -> Figure:
 
 
 def _panels(
-    titles: Sequence[str], label: str, *, width_in: float = _PANEL_IN[0]
+    titles: Sequence[str], label: str, *, width_in: float = _PANEL_IN[0], shared: bool = True
 ) -> tuple[Figure, list[Axes]]:
-    """A row of panels (rows, where they are many) that share their vertical axis."""
+    """A row of panels, or rows where they are many."""
     count = max(len(titles), 1)
     columns = max(1, min(count, int(_MAX_WIDTH_IN / width_in)))
     rows = -(-count // columns)
     figure = blank(max(columns * width_in + 0.6, 3.2), rows * _PANEL_IN[1] + 0.5)
-    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    grid = figure.subplots(rows, columns, sharey=shared, squeeze=False)
     axes = list(grid.ravel())
     for one in axes[count:]:
         one.remove()
@@ -367,9 +373,9 @@ def _panels(
 
 
 def _from_zero(axes: Sequence[Axes]) -> None:
-    """The shared axis begins at zero; done last, since a limit ends the automatic choice."""
-    if axes:
-        axes[0].set_ylim(bottom=0.0)
+    """The vertical axes begin at zero; done last, since a limit ends the automatic choice."""
+    for one in axes:
+        one.set_ylim(bottom=0.0)
 
 
 def _dress(axes: Axes) -> None:

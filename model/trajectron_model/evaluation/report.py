@@ -143,9 +143,9 @@ def boxplot(
         style,
         name=f"boxplots-{error.lower()}",
         label=f"{error}, m",
-        caption=f"{error} of every sample of every judged agent: boxes span the quartiles, "
-        "whiskers 5% to 95%, crosses are means. Entries with a single trajectory are dashed lines "
-        "at their mean.",
+        caption=f"{error} of every sample of every judged agent, each set on its own axis: boxes "
+        "span the quartiles, whiskers 5% to 95%, crosses are means. Entries with a single "
+        "trajectory are dashed lines at their mean.",
     )
 
 
