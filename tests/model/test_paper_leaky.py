@@ -15,7 +15,8 @@ from trajectron_model.checkpoint import Checkpoint, CheckpointError
 from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
-from trajectron_model.evaluation import protocols
+from trajectron_model.evaluation import metrics, protocols
+from trajectron_model.evaluation.contenders import ContenderError, resolve
 from trajectron_model.evaluation.plan import PlanError
 from trajectron_model.latent import categorical_kl
 from trajectron_model.paper_leaky import NAME, WARNING, saving
@@ -282,6 +283,47 @@ def test_a_few_steps_learn_a_simulated_crowd(tmp_path: Path) -> None:
 def test_kl_of_equal_distributions_is_zero() -> None:
     log_p = network().prior(torch.randn(2, 40))
     assert torch.allclose(categorical_kl(log_p, log_p), torch.zeros(2, 2))
+
+
+# --- the bundled networks
+
+BUNDLED = [name for name in TEST_SETS if saving.bundled(name, 0).with_suffix(".json").exists()]
+
+
+@pytest.mark.parametrize("test_set", BUNDLED)
+def test_bundled_networks_carry_the_warning_and_never_saw_their_test_set(
+    test_set: str, eth_ucy: EthUcy
+) -> None:
+    recordings = eth_ucy.test(test_set)
+    contender = resolve(NAME, test_set, recordings)
+    assert contender.seen and not contender.seen_of(recordings)
+    assert contender.predictor.name.endswith("(inputs contain the future)")
+    assert saving.load(saving.bundled(test_set, 0))[1].provenance["warning"] == WARNING
+
+
+def test_the_papers_figures_on_eth_are_reproduced(eth_ucy: EthUcy) -> None:
+    """Full, best of 100, joint over the scene: 0.37/0.72 in the paper's Table 1."""
+    recordings = eth_ucy.test("eth")
+    predictor = resolve(NAME, "eth", recordings).predictor
+    windows = protocols.windows("paper", recordings)
+    forecasts = predictor.predict(windows, num_samples=100, seed=0)
+    errors: dict[str, list[float]] = {"ade": [], "fde": []}
+    for window, forecast in zip(windows, forecasts, strict=True):
+        counted = window.in_best_of
+        assert counted is not None
+        if not counted.any():
+            continue
+        distance = metrics.displacement(forecast.samples[:, counted], window.future()[counted])
+        errors["ade"] += metrics.joint_best_of(metrics.average_displacement(distance), 100).tolist()
+        errors["fde"] += metrics.joint_best_of(metrics.final_displacement(distance), 100).tolist()
+    assert len(errors["ade"]) == 303
+    assert np.mean(errors["ade"]) == pytest.approx(0.37, rel=0.1)
+    assert np.mean(errors["fde"]) == pytest.approx(0.72, rel=0.1)
+
+
+def test_it_is_for_the_papers_sets_alone() -> None:
+    with pytest.raises(ContenderError, match="alone, not on plaza"):
+        resolve(NAME, "plaza", [walk()])
 
 
 # --- the fence
