@@ -42,7 +42,8 @@ class CreateEvaluationRequest(Body):
         (),
         description="The models and baselines to compare, in order: names from `GET /v1/models`, "
         "bundled models, `leave-one-out` (on each set the bundled model that was trained without "
-        "it), and baselines such as `constant-velocity`.",
+        "it), and baselines such as `constant-velocity`. `NAME@z_best` judges a model's most "
+        "probable mode alone, `NAME@stratified` its stratified samples.",
     )
     dataset: str = Field(
         "", description="A data set that the server knows: `eth_ucy`. None for files sent along."

@@ -19,6 +19,7 @@ from trajectron_service.evaluations import queue
 from trajectron_service.evaluations.background import Background, told
 from trajectron_service.evaluations.folders import EvaluationFolder
 from trajectron_service.evaluations.jobs import Evaluations
+from trajectron_service.evaluations.launch import Priority
 from trajectron_service.evaluations.messages import (
     EvaluationConfig,
     EvaluationInfo,
@@ -329,6 +330,26 @@ async def test_a_process_beside_ends_with_the_service_and_with_its_block(
             process.stdin.close()
             assert await process.wait() == 1
     assert process.returncode == (1 if let_go else -signal.SIGTERM)
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="priorities are those of Linux")
+@pytest.mark.parametrize(("priority", "nice"), [("idle", 19), ("low", 19), ("normal", 0)])
+async def test_a_process_beside_takes_its_priority(
+    tmp_path: Path, priority: Priority, nice: int
+) -> None:
+    endless = tmp_path / "endless.csv"
+    os.mkfifo(endless)
+    expected = min(19, os.getpriority(os.PRIO_PROCESS, 0) + nice), priority == "idle"
+    background = Background(priority, 1)
+    async with background.process("reading", "10", str(endless), folder=tmp_path) as process:
+
+        def taken() -> tuple[int, bool]:
+            idle = os.sched_getscheduler(process.pid) == os.SCHED_IDLE
+            return os.getpriority(os.PRIO_PROCESS, process.pid), idle
+
+        async with asyncio.timeout(60):
+            while taken() != expected:  # noqa: ASYNC110  it is another process that changes it
+                await asyncio.sleep(0.01)
 
 
 def test_the_last_words_of_a_process_are_its_reason(tmp_path: Path) -> None:

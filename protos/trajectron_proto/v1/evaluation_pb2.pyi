@@ -187,6 +187,8 @@ class EvaluationConfig(_message.Message):
         """The models and baselines to compare, in order, at least one: names from
         ListModels, bundled models, "leave-one-out" (on each set the bundled model
         that was trained without it), and baselines such as "constant-velocity".
+        NAME@z_best judges a model's most probable mode alone, NAME@stratified its
+        stratified samples.
         """
 
     @_builtins.property

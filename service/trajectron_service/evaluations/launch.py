@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import orjson
@@ -22,6 +23,7 @@ Priority = Literal["idle", "low", "normal"]
 """``low`` is the lowest nice value; ``idle`` runs where nothing else wants to."""
 
 _LOWEST_NICE = 19
+_AUTOGROUP = Path("/proc/self/autogroup")
 _STDIN, _STDOUT = 0, 1
 
 
@@ -46,6 +48,11 @@ def _lower(priority: str) -> None:
         raise SystemExit(f"{priority}: not a priority")
     if priority != "normal":
         os.nice(_LOWEST_NICE)
+        # Where Linux groups processes by session, a nice value counts within the session only:
+        # then the session is what has to be nice, where it is this process's own.
+        if _AUTOGROUP.exists() and os.getsid(0) == os.getpid():
+            with suppress(OSError):  # as in some containers
+                _AUTOGROUP.write_text(str(_LOWEST_NICE))
     if priority == "idle" and hasattr(os, "SCHED_IDLE"):
         # Some containers forbid it; then the nice value has to do.
         with suppress(PermissionError):
