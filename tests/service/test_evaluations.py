@@ -275,6 +275,19 @@ async def test_draining_refuses_calls_and_ends_watches(
             assert caught.value.kind is ErrorKind.DRAINING
 
 
+async def test_a_slow_reader_misses_what_is_superseded_but_never_the_end(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(at_once)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        watching = evaluations.watch("a")
+        first = await anext(watching)
+        assert not first.state.ended
+        await until(evaluations, "a", EvaluationState.SUCCEEDED)
+        assert [info.state async for info in watching] == [EvaluationState.SUCCEEDED]
+
+
 async def test_metrics_count_evaluations_by_state(
     settings: Settings, carried: Callable[[Run], None]
 ) -> None:

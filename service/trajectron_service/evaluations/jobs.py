@@ -207,11 +207,12 @@ class Evaluations:
         with self._work.taken():
             job = self._job(identity)
         while True:
-            changed = job.changed
+            # Read before it is given: it may change while a slow reader takes its time.
+            changed, info = job.changed, job.info
             if job.removed:
                 raise _unknown(identity)
-            yield job.info
-            if job.state.ended:
+            yield info
+            if info.state.ended:
                 return
             if self._work.draining:
                 raise stopping()
