@@ -287,10 +287,8 @@ def test_kl_of_equal_distributions_is_zero() -> None:
 
 # --- the bundled networks
 
-BUNDLED = [name for name in TEST_SETS if saving.bundled(name, 0).with_suffix(".json").exists()]
 
-
-@pytest.mark.parametrize("test_set", BUNDLED)
+@pytest.mark.parametrize("test_set", TEST_SETS)
 def test_bundled_networks_carry_the_warning_and_never_saw_their_test_set(
     test_set: str, eth_ucy: EthUcy
 ) -> None:

@@ -52,9 +52,9 @@ def loss_terms(
 ) -> Terms:
     """The negative ELBO of the people present at one step of each chunk of a batch.
 
-    The original also averages over empty slots, which have nothing to teach and cost most of
-    its time; they are left out. A person who leaves within the horizon keeps, as there, the
-    absent steps' constant (0 - mean) / std as target.
+    The original also averages over empty slots, which cost most of its time; they are left out
+    (docs/paper-leaky.md says what that seems to change). A person who leaves within the
+    horizon keeps, as there, the absent steps' constant (0 - mean) / std as target.
 
     Args:
         chunk: [B] chunks, repeats allowed.
