@@ -55,10 +55,13 @@ def social_tensor(
     """
     samples, agents, size = hidden.shape
     offset = position[:, pairs.sender] - position[:, pairs.receiver]  # [S, E, 2]
-    cell = torch.where(seen, grid_cell(offset, cells, width_m), -1)  # [S, E]
-    sample, pair = (cell >= 0).nonzero(as_tuple=True)
-    row = sample * agents + pairs.receiver[pair]
-    target = row * cells**2 + cell[sample, pair]
+    # Few of a crowd's pairs are near: the rest is done for those alone.
+    near = (offset.abs().amax(-1) <= 0.5 * width_m) & seen  # [S, E]
+    sample, pair = near.nonzero(as_tuple=True)
+    cell = grid_cell(offset[sample, pair], cells, width_m)
+    inside = cell >= 0
+    sample, pair, cell = sample[inside], pair[inside], cell[inside]
+    target = (sample * agents + pairs.receiver[pair]) * cells**2 + cell
     total = hidden.new_zeros(samples * agents * cells**2, size)
     total = total.index_add(0, target, hidden[sample, pairs.sender[pair]])
     return total.view(samples, agents, cells**2 * size)
