@@ -17,7 +17,8 @@ from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window
 from trajectron_model.evaluation import metrics, protocols
 from trajectron_model.evaluation.contenders import ContenderError, resolve
-from trajectron_model.evaluation.plan import PlanError
+from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
+from trajectron_model.evaluation.run import run
 from trajectron_model.latent import categorical_kl
 from trajectron_model.paper_leaky import NAME, WARNING, saving
 from trajectron_model.paper_leaky.chunks import CHUNK_STEPS, ChunkSet, cut, kinematics
@@ -339,6 +340,16 @@ def test_no_registry_and_no_checkpoint_reader_takes_it(tmp_path: Path) -> None:
 
 def test_its_name_in_tables_is_a_warning() -> None:
     assert "future" in LeakyPredictor(network(), [walk()]).name
+
+
+def test_its_row_carries_the_warning(eth_ucy: EthUcy, tmp_path: Path) -> None:
+    plan = EvaluationPlan(
+        (NAME,), ("zara1",), protocol="paper", samples=2, kde_samples=2, max_windows=2
+    )
+    evaluation = run(plan, tmp_path, data=eth_ucy.folder)
+    assert "paper-leaky (inputs contain the future)" in evaluation.to_markdown()
+    (row,) = evaluation.rows
+    assert row.sets[0].model == "paper-leaky (inputs contain the future)"
 
 
 def test_it_forecasts_no_window_but_the_papers() -> None:

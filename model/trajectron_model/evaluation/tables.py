@@ -18,6 +18,9 @@ from trajectron_model.evaluation.results import (
 _BEST_OF = (5, 20, 100)
 _LEVELS = (50, 80, 90, 95)
 
+_LEAKING = "paper-leaky"
+_LEAKING_MARK = " (inputs contain the future)"
+
 _Line = tuple[str, Callable[[Scores], str]]
 
 
@@ -44,6 +47,7 @@ def to_markdown(evaluation: Evaluation) -> str:
     table = [header, ["", "windows / judged agents", *counts, ""]]
     for row in evaluation.rows:
         name = row.name + IN_SAMPLE_MARK * row.in_sample
+        name += _LEAKING_MARK * row.name.startswith(_LEAKING)
         for label, cells in _lines(row):
             table.append([name, label, *cells])
             name = ""
