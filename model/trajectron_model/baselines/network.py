@@ -22,8 +22,8 @@ from trajectron_model.predictor import WindowForecast
 DT_S = 0.4
 """Steps of the recordings that the baselines were published on."""
 
-_MAX_ROWS = 16_000
-"""Trajectories rolled out at once: 128 hidden values of each are 8 megabytes."""
+_MAX_ROWS = 2_000
+"""Trajectories rolled out at once: their gates, 256 values each, then stay in the cache."""
 _MAX_AGENTS = 256
 
 
