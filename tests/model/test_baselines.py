@@ -23,6 +23,7 @@ from trajectron_model.baselines.kalman_fitting import fit, mean_log_density
 from trajectron_model.baselines.linear import Linear, extended
 from trajectron_model.baselines.network import NetworkPredictor
 from trajectron_model.checkpoint import CheckpointError
+from trajectron_model.data.eth_ucy import TEST_SETS
 from trajectron_model.data.recording import Recording
 from trajectron_model.data.windows import Window, sgan_windows
 from trajectron_model.predictor import DensityPredictor, Predictor, WindowForecast
@@ -162,6 +163,43 @@ def test_an_absent_agent_cannot_be_judged(name: str) -> None:
     gone = window(straight(8), straight(7))
     with pytest.raises(ValueError, match="absent at the newest observed step"):
         made(name).predict([gone], num_samples=1, seed=0)
+
+
+@pytest.mark.parametrize("test_set", [*TEST_SETS, None])
+@pytest.mark.parametrize("name", registry.LEARNED)
+def test_what_was_learned_is_bundled_and_says_from_what(name: str, test_set: str | None) -> None:
+    held_out = {
+        "eth": {"biwi_eth"},
+        "hotel": {"biwi_hotel"},
+        "univ": {"students001", "students003"},
+        "zara1": {"crowds_zara01"},
+        "zara2": {"crowds_zara02"},
+    }
+    predictor = registry.baseline(name, test_set)
+    (forecast,) = predictor.predict([window(straight(8))], num_samples=2, seed=0)
+    assert np.isfinite(forecast.samples).all()
+    facts = registry.provenance(name, test_set)
+    seen = facts["training"]["recordings"] + facts["validation"]["recordings"]
+    assert seen and all(len(one["sha256"]) == 64 for one in seen)
+    names = {one["name"] for one in seen}
+    assert names == {
+        "biwi_eth",
+        "biwi_hotel",
+        "crowds_zara01",
+        "crowds_zara02",
+        "crowds_zara03",
+        "students001",
+        "students003",
+        "uni_examples",
+    } - held_out.get(test_set or "", set())
+    assert facts["outcome"] in ("converged", "reached the cap") and "licence" in facts
+    assert len(registry.sha256(name, test_set)) == 64
+
+
+@pytest.mark.parametrize("name", sorted(set(registry.NAMES) - set(registry.LEARNED)))
+def test_what_learns_nothing_has_no_provenance(name: str) -> None:
+    assert not registry.provenance(name, "zara1")
+    assert not registry.sha256(name, "zara1")
 
 
 def test_unknown_baselines_and_missing_weights_are_answered_with_what_there_is() -> None:
