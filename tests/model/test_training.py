@@ -184,7 +184,7 @@ def test_batches_follow_from_their_number() -> None:
 
 def test_examples_are_true_stretches_of_the_recording() -> None:
     made = recording()
-    plain = replace(QUICK.examples, mirror=False, scale=0.0, input_noise_m=0.0)
+    plain = replace(QUICK.examples, mirror=False, scale=0.0, input_noise_m=0.0, pace=0.0)
     batch = Examples([made], SMALL, plain, seed=0).batch(0)
     steps = np.diff(batch.future, axis=1)
     step_of = {

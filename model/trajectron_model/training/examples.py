@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.history import History
+from trajectron_model.training import augmentation
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class ExampleSettings:
         input_noise_m: the roughest noise on observed positions. A scene's standard deviation
             is this times the square of a uniform number: most scenes are nearly clean, some
             as rough as a poor tracker's tracks, and the encoder has to tell which.
+        pace: share of scenes that are played at a changing pace (`augmentation.paced`).
     """
 
     agents: int = 128
@@ -41,6 +43,7 @@ class ExampleSettings:
     mirror: bool = True
     scale: float = 0.3
     input_noise_m: float = 0.1
+    pace: float = 0.25
 
 
 class Batch(NamedTuple):
@@ -115,15 +118,16 @@ class Examples:
     def _scene(self, random: np.random.Generator, steps: int) -> Batch:
         number, now = self._starts[random.integers(len(self._starts))]
         recording, horizon = self.recordings[number], self.config.horizon
-        first, last = max(0, now + 1 - steps), min(recording.num_steps, now + 1 + horizon)
+        ahead = horizon + augmentation.steps_beyond(horizon)
+        first, last = max(0, now + 1 - steps), min(recording.num_steps, now + 1 + ahead)
         agents, dense = recording.dense(first, last)
-        position = np.full((steps + horizon, len(agents), 2), np.nan)
+        position = np.full((steps + ahead, len(agents), 2), np.nan)
         begin = steps - (now + 1 - first)
         position[begin : begin + len(dense)] = dense
         kinds = self._types[number][agents]
         observed = ~np.isnan(position[:steps, :, 0]).all(axis=0)
         position, kinds = position[:, observed], kinds[observed]
-        position = self._augment(position, steps, random)
+        position = self._augment(position, steps, random)[: steps + horizon]
         present = ~np.isnan(position[..., 0])  # [T + H, N]
         known = np.logical_and.accumulate(present[steps:], axis=0)
         moves = np.array([not t.stationary for t in self.config.types])
@@ -141,18 +145,19 @@ class Examples:
     def _augment(
         self, position: NDArray[np.float64], steps: int, random: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Mirrors and stretches a scene about the middle of its observed steps.
+        """Another scene about the middle of its observed steps, mirrored, stretched, paced.
 
         With ``world`` features places mean something: scenes stay where and as they were.
         """
         if self.config.features == "world":
             return position
         position = position - np.nanmean(position[:steps], axis=(0, 1))
-        if self.settings.mirror and random.random() < 0.5:
-            position = position * np.array([1.0, -1.0])
+        if self.settings.mirror:
+            position = augmentation.mirrored(position, random)
         if self.settings.scale:
-            span = np.log1p(self.settings.scale)
-            position = position * np.exp(random.uniform(-span, span))
+            position = augmentation.stretched(position, self.settings.scale, random)
+        if self.settings.pace and random.random() < self.settings.pace:
+            position = augmentation.paced(position, steps - 1, random)
         return position
 
 

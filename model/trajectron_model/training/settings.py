@@ -26,7 +26,7 @@ class TrainSettings:
         threads: of torch; None leaves them as they are.
     """
 
-    steps: int = 1300
+    steps: int = 1100
     learning_rate: float = 2e-3
     warm_up: float = 0.1
     clip_norm: float = 1.0

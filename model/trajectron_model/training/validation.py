@@ -73,7 +73,12 @@ class Validation:
                 f"{config.observed_steps + config.horizon} steps on end"
             )
         settings = ExampleSettings(
-            short_history=0.0, long_history=0.0, mirror=False, scale=0.0, input_noise_m=0.0
+            short_history=0.0,
+            long_history=0.0,
+            mirror=False,
+            scale=0.0,
+            input_noise_m=0.0,
+            pace=0.0,
         )
         self._examples = Examples(recordings, config, settings, _SEED)
 
