@@ -175,6 +175,18 @@ def test_provenance_names_data_settings_and_figures(tmp_path: Path) -> None:
     assert facts["settings"]["seed"] == 0
 
 
+def test_the_spread_is_fitted_at_the_end_unless_declined(tmp_path: Path) -> None:
+    run(tmp_path / "plain", replace(QUICK, calibrate=False))
+    run(tmp_path / "fitted")
+    plain, fitted = (
+        Checkpoint.load(tmp_path / name / "model").model for name in ("plain", "fitted")
+    )
+    assert plain.config.types[0].dispersion == ()
+    assert len(fitted.config.types[0].dispersion) == SMALL.horizon
+    for name, weight in plain.state_dict().items():
+        torch.testing.assert_close(weight, fitted.state_dict()[name], rtol=0.0, atol=0.0)
+
+
 def test_batches_follow_from_their_number() -> None:
     examples = Examples([recording()], SMALL, QUICK.examples, seed=3)
     fifth, again, sixth = (examples.batch(number).future for number in (5, 5, 6))
@@ -213,6 +225,27 @@ def test_inputs_of_an_example_are_causal(preset: str) -> None:
         scenes.append(examples._scene(np.random.default_rng(1), 4))
     np.testing.assert_array_equal(scenes[0].past.position, scenes[1].past.position)
     assert (scenes[0].future != scenes[1].future).any()
+
+
+def test_a_changing_pace_leaves_the_newest_places_and_changes_the_futures() -> None:
+    made = recording()
+    plain = replace(QUICK.examples, mirror=False, scale=0.0, input_noise_m=0.0)
+    usual, paced = (
+        Examples([made], SMALL, replace(plain, pace=share), seed=0).batch(0) for share in (0.0, 1.0)
+    )
+    here = np.flatnonzero(paced.past.present[-1])
+    first, second = (index.ravel() for index in np.meshgrid(here, here))
+    together = paced.past.scene[first] == paced.past.scene[second]
+    newest = paced.past.position[-1]
+    between = (newest[first] - newest[second])[together]
+    true = (made.position[:, None] - made.position[None]).reshape(-1, 2)
+    assert np.abs(between[:, None] - true).max(axis=-1).min(axis=-1).max() < 1e-9
+    ratios = []
+    for batch in (usual, paced):
+        step = np.linalg.norm(np.diff(batch.future[batch.known.all(axis=1)], axis=1), axis=-1)
+        ratios.append(step[:, -1] / step[:, 0])
+    np.testing.assert_allclose(ratios[0], 1.0)  # they walk at one speed each
+    assert ratios[1].min() < 0.9 and np.ptp(ratios[1]) > 0.1
 
 
 def test_the_papers_inputs_are_places_in_the_world() -> None:

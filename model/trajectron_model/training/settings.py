@@ -24,6 +24,7 @@ class TrainSettings:
         validate_every: steps between validations; the best of them is kept.
         seed: of weights, examples and noise.
         threads: of torch; None leaves them as they are.
+        calibrate: whether the spread of the modes is fitted to validation data at the end.
     """
 
     steps: int = 1100
@@ -33,6 +34,7 @@ class TrainSettings:
     validate_every: int = 100
     seed: int = 0
     threads: int | None = None
+    calibrate: bool = True
     examples: ExampleSettings = field(default_factory=ExampleSettings)
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
 

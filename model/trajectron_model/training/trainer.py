@@ -61,7 +61,7 @@ def train(
     device: str | None = None,
     resume: bool = False,
 ) -> Checkpoint:
-    """Trains a model, leaves the best one, by validation, in ``folder``, and calibrates it.
+    """Trains a model and leaves the best one, by validation, in ``folder``, calibrated.
 
     Args:
         config: of the model.
@@ -119,6 +119,8 @@ def train(
                 save(folder / CHECKPOINT_NAME, model, {**facts, "selected": selected})
             resuming.save(folder, model, optimiser, run)
         observe(Progress(run.step, rate, terms, figures, run.best_step))
+    if not settings.calibrate:
+        return Checkpoint.load(folder / CHECKPOINT_NAME)
     return _with_calibration(folder / CHECKPOINT_NAME, judge, device)
 
 
