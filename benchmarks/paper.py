@@ -2,10 +2,12 @@
 
     python -m benchmarks.paper --data path/to/eth_ucy          (make paper; some hours)
     python -m benchmarks.paper --quick                         (a few windows and samples)
+    python -m benchmarks.paper --only streaming sgan           (these alone, and no report)
 
 Every figure comes from the evaluation harness (`trajectron_model.evaluation.run`), the path of
 the command line and of the service. Work is kept in `--work` and goes on where it stopped; what
-is done already costs nothing. The report goes to `--out`: `report.html`, `report.md`, figures,
+is done already costs nothing, and processes that are told to do different things share it. The
+report goes to `--out`: `report.html`, `report.md`, figures,
 and the estimates as JSON.
 """
 
@@ -192,21 +194,19 @@ def measure(options: Options) -> Results:
     """Carries out all evaluations and timings, from where an earlier call stopped."""
     recordings = _recordings(options)
     missing: dict[str, str] = {}
-    evaluations: dict[str, Evaluation] = {}
-    folders: dict[str, Path] = {}
-    for name, wanted in plans(options).items():
-        plan = available(wanted, recordings, missing)
-        if name == "leaky" and plan.entries == (options.ours,):
-            continue
-        folders[name] = options.work / f"{name}-{_key(plan)}"
-        with _bar(name) as show:
-            evaluations[name] = run.run(plan, folders[name], data=options.data, progress=show)
-    table_1 = evaluations["table-1"].fingerprint.plan
+    wanted = {name: available(one, recordings, missing) for name, one in plans(options).items()}
+    wanted = {
+        name: plan
+        for name, plan in wanted.items()
+        if name != "leaky" or plan.entries != (options.ours,)
+    }
+    evaluations = {name: carry_out(options, name, plan) for name, plan in wanted.items()}
     models = {name: _model(options, name) for name in recordings}
+    table_1 = wanted["table-1"]
     return Results(
         ours=options.ours,
         evaluations=evaluations,
-        scores=run.load_scores(table_1, folders["table-1"], data=options.data),
+        scores=run.load_scores(table_1, _folder(options, "table-1", table_1), data=options.data),
         timings=_timings(options, recordings, models),
         recordings=recordings,
         models=models,
@@ -215,9 +215,16 @@ def measure(options: Options) -> Results:
     )
 
 
-def _key(plan: EvaluationPlan) -> str:
-    """Names the folder of a plan's work: another plan never finds it."""
-    return hashlib.sha256(json.dumps(plan.to_json()).encode()).hexdigest()[:8]
+def carry_out(options: Options, name: str, plan: EvaluationPlan) -> Evaluation:
+    """Carries out one evaluation, showing its progress."""
+    with _bar(name) as show:
+        return run.run(plan, _folder(options, name, plan), data=options.data, progress=show)
+
+
+def _folder(options: Options, name: str, plan: EvaluationPlan) -> Path:
+    """Where a plan's work is kept: another plan never finds it."""
+    key = hashlib.sha256(json.dumps(plan.to_json()).encode()).hexdigest()[:8]
+    return options.work / f"{name}-{key}"
 
 
 @contextmanager
@@ -325,6 +332,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", default=registry.DEFAULT, help="judged on --recording")
     parser.add_argument("--models", default=",".join(BASELINES), help="that stand beside ours")
     parser.add_argument("--quick", action="store_true", help="few windows and samples")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="evaluations, without a report")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path(".paper"))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/paper"))
@@ -341,6 +349,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seed=found.seed,
     )
     options.work.mkdir(parents=True, exist_ok=True)
+    if found.only is not None:
+        known = plans(options)
+        if unknown := [name for name in found.only if name not in known]:
+            parser.error(f"no evaluation {unknown[0]!r}: there are {', '.join(known)}")
+        for name in found.only:
+            carry_out(options, name, available(known[name], _recordings(options), {}))
+        return
     results = measure(options)
     write(results, options.out)
     for entry, why in results.missing.items():

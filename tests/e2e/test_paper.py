@@ -70,6 +70,11 @@ def test_a_quick_run_reports_everything_and_goes_on_where_it_stopped(
     with pytest.raises(KeyboardInterrupt):
         paper.main(asked)
     assert not (tmp_path / "out").exists()
+    paper.main([*asked, "--only", "streaming"])  # as a second process would
+    assert not (tmp_path / "out").exists()
+    assert len(list(tmp_path.glob("work/streaming-*/result.json"))) == 1
+    with pytest.raises(SystemExit):
+        paper.main([*asked, "--only", "table-2"])
     paper.main(asked)
     # Nothing was judged twice but the one that was lost.
     assert len(judged) == len(list(tmp_path.glob("work/*/shards/*.npz"))) + 1

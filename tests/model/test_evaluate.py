@@ -113,6 +113,19 @@ def test_scores_are_those_computed_by_hand(stand: Stand, square: str, tmp_path: 
     assert "min_fde_20" not in found  # five samples were drawn
 
 
+def test_of_dependent_samples_there_is_a_best_of_all_alone(
+    stand: Stand, square: str, tmp_path: Path
+) -> None:
+    """Some of a stratified draw are not a stratified draw: nothing is said of their best."""
+    stand(model=Contender(Drifting(MISSES_M), independent=False))
+    found = values(run.run(plan(square), tmp_path / "work"))
+    assert found["min_fde_5"] == pytest.approx(0.5)
+    assert not {"min_fde_1", "joint_fde_1", "miss_1"} & found.keys()
+    fewer = values(run.run(plan(square, samples=1, kde_samples=5), tmp_path / "fewer"))
+    assert not [name for name in fewer if name.startswith(("min_", "joint_", "miss_"))]
+    assert fewer["fde_sample"] == pytest.approx(4.5)  # of the one that counts
+
+
 def test_best_of_n_is_over_the_agents_that_count(stand: Stand, tmp_path: Path) -> None:
     """Under ``paper``: the second walker is not seen from t - 8 on, at the first t."""
     file = tmp_path / "chunk.txt"
@@ -241,6 +254,12 @@ def test_in_sample_on_request_marks_the_row(stand: Stand, square: str, tmp_path:
 
 
 # Names.
+
+
+def test_samples_of_the_stratified_variant_alone_are_dependent() -> None:
+    entries = ("leave-one-out", "leave-one-out@z_best", "leave-one-out@stratified", "kalman")
+    found = [contenders.resolve(entry, "zara1").independent for entry in entries]
+    assert found == [True, True, False, True]
 
 
 def test_names_stand_for_baselines_and_bundled_models() -> None:

@@ -43,15 +43,23 @@ class Contender:
         sha256: of the model's file; empty for a baseline without one.
         seen: the recordings it was trained and selected on, as `Recording.provenance` has
             them; empty for a baseline that learns nothing, None where a model does not say.
+        independent: whether its samples are, so that some of them are what asking for fewer
+            would have given.
     """
 
     predictor: Predictor
     sha256: str = ""
     seen: tuple[Mapping[str, str], ...] | None = ()
+    independent: bool = True
 
     @classmethod
     def of_model(
-        cls, predictor: Predictor, sha256: str, provenance: Mapping[str, object]
+        cls,
+        predictor: Predictor,
+        sha256: str,
+        provenance: Mapping[str, object],
+        *,
+        independent: bool = True,
     ) -> Contender:
         """A trained model, with what its checkpoint says it was trained and selected on.
 
@@ -59,8 +67,9 @@ class Contender:
             predictor: the model's.
             sha256: of the checkpoint.
             provenance: the checkpoint's; ``training`` and ``validation`` hold ``recordings``.
+            independent: see the class.
         """
-        return cls(predictor, sha256, _recordings_seen(provenance))
+        return cls(predictor, sha256, _recordings_seen(provenance), independent)
 
     def seen_of(self, recordings: Iterable[Recording]) -> tuple[str, ...]:
         """The names of those recordings that it has seen; all where it does not say."""
@@ -133,7 +142,12 @@ def _model(name: str, variant: str) -> Contender:
         mode="z_best" if variant == Z_BEST else "full",
         sampling="stratified" if variant == STRATIFIED else "iid",
     )
-    return Contender.of_model(predictor, checkpoint.sha256, checkpoint.provenance)
+    return Contender.of_model(
+        predictor,
+        checkpoint.sha256,
+        checkpoint.provenance,
+        independent=variant != STRATIFIED,
+    )
 
 
 def _baseline(name: str, test_set: str | None) -> Contender:

@@ -17,7 +17,7 @@ from trajectron_model.evaluation.scores import AgentScores, Float
 from trajectron_model.predictor import DensityPredictor, Predictor, WindowForecast
 
 BEST_OF = (1, 5, 20, 100)
-"""The N of best-of-N; those above the number of samples are left out."""
+"""The N of best-of-N; those that there are no samples for are left out."""
 
 BEST_AT_EACH_STEP = 20
 """The N of best-of-N with the best chosen at every horizon step for itself."""
@@ -38,11 +38,15 @@ class Judgement:
         samples: drawn for each agent that count in best-of-N and metrics of pairs.
         kde_samples: those in kernel density estimates; fewer than two for none.
         seed: of the samples and of draws from forecast densities.
+        independent: whether samples are. Where they are not, as with stratified ones, some of
+            them are not what asking for fewer gives: best of all that were drawn is the only
+            best-of-N there is.
     """
 
     samples: int
     kde_samples: int
     seed: int
+    independent: bool = True
 
     @property
     def drawn(self) -> int:
@@ -52,7 +56,11 @@ class Judgement:
     @property
     def best_of(self) -> tuple[int, ...]:
         """The N that there are samples for."""
-        return tuple(n for n in BEST_OF if n <= self.samples)
+        return tuple(n for n in BEST_OF if self.holds(n))
+
+    def holds(self, n: int) -> bool:
+        """Whether the samples give a best of ``n``."""
+        return n <= self.samples if self.independent else n == self.samples == self.drawn
 
 
 def judge(
@@ -163,7 +171,7 @@ def _sample_columns(
             columns[f"min_{name}_{n}"] = metrics.best_of(error, n)
             columns[f"joint_{name}_{n}"] = metrics.joint_best_of(error, n)
         columns[f"miss_{n}"] = metrics.miss_rate(errors["fde"], n)
-    if how.samples >= BEST_AT_EACH_STEP:
+    if how.holds(BEST_AT_EACH_STEP):
         flat = distance.reshape(len(distance), -1)  # [S, A' H]
         best = metrics.best_of(flat, BEST_AT_EACH_STEP)
         columns[f"min_distance_{BEST_AT_EACH_STEP}"] = best.reshape(distance.shape[1:])

@@ -112,7 +112,7 @@ def run(
             scores = judge(
                 shard.contender.predictor,
                 shard.test_set.windows[shard.first : shard.last],
-                _judgement(plan),
+                _judgement(plan, shard.contender),
                 first=shard.first,
             )
             write_atomically(shard.file, scores.to_bytes())
@@ -164,8 +164,8 @@ def _claim(plan: EvaluationPlan, folder: Path) -> None:
     write_atomically(file, (json.dumps(plan.to_json(), indent=1) + "\n").encode())
 
 
-def _judgement(plan: EvaluationPlan) -> Judgement:
-    return Judgement(plan.samples, plan.samples_in_kde, plan.seed)
+def _judgement(plan: EvaluationPlan, contender: Contender) -> Judgement:
+    return Judgement(plan.samples, plan.samples_in_kde, plan.seed, contender.independent)
 
 
 def _shards(plan: EvaluationPlan, folder: Path, test_sets: Sequence[TestSet]) -> list[_Shard]:
@@ -179,7 +179,8 @@ def _shards(plan: EvaluationPlan, folder: Path, test_sets: Sequence[TestSet]) ->
             if not plan.in_sample:
                 contender.refuse_in_sample(test_set.name, test_set.recordings)
             # What is in a shard's name is all that its scores depend on.
-            of = (_VERSION, contender.predictor.name, contender.sha256, _judgement(plan), data)
+            how = _judgement(plan, contender)
+            of = (_VERSION, contender.predictor.name, contender.sha256, how, data)
             key = hashlib.sha256(repr((of, plan.jitter_m, _TRAJECTORIES)).encode()).hexdigest()
             first = 0
             for batch in batches(test_set.windows, most):
