@@ -31,8 +31,8 @@ def stretched(
     position: NDArray[np.float64], scale: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
     """The scene, [..., 2] metres, times a factor from [1 / (1 + scale), 1 + scale]."""
-    span = np.log1p(scale)
-    return position * np.exp(random.uniform(-span, span))
+    span = math.log1p(scale)
+    return position * math.exp(random.uniform(-span, span))
 
 
 def paced(
