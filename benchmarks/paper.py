@@ -50,6 +50,7 @@ BASELINES = (
     "constant-velocity",
 )
 JITTERS_M = (0.02, 0.05, 0.10)
+FEW_WINDOWS = 250  # of each set, every k-th: of what is compared along itself, not with others
 SCENES, REPEATS = 12, 5  # of each set, in the table of runtimes
 _QUICK_SCENES, _QUICK_REPEATS = 2, 1
 _MOST_SEEDS = 100
@@ -117,6 +118,7 @@ def plans(options: Options) -> dict[str, EvaluationPlan]:
         max_windows=4 if options.quick else None,
         bootstrap=100 if options.quick else 1000,
     )
+    thinned = replace(full, max_windows=4 if options.quick else FEW_WINDOWS)
     many, some, few = (20, 20, 20) if options.quick else (2000, 100, 20)
     jittered = tuple(name for name in full.entries if name in (options.ours, *_JITTERED))
     found = {
@@ -130,11 +132,11 @@ def plans(options: Options) -> dict[str, EvaluationPlan]:
         "sgan": replace(
             full, entries=(options.ours, options.stratified, *options.entries), samples=some
         ),
-        "streaming": replace(full, protocol="streaming", samples=few),
+        "streaming": replace(thinned, protocol="streaming", samples=few),
     }
     for jitter_m in (0.0, *JITTERS_M):
         found[jitter_name(jitter_m)] = replace(
-            full, entries=jittered, samples=few, jitter_m=jitter_m
+            thinned, entries=jittered, samples=few, jitter_m=jitter_m
         )
     if options.sets:
         found["leaky"] = replace(
