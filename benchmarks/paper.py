@@ -3,6 +3,7 @@
     python -m benchmarks.paper --data path/to/eth_ucy          (make paper; some hours)
     python -m benchmarks.paper --quick                         (a few windows and samples)
     python -m benchmarks.paper --only streaming sgan           (these alone, and no report)
+    python -m benchmarks.paper --samples 200                   (2000 in the paper: the long part)
 
 Every figure comes from the evaluation harness (`trajectron_model.evaluation.run`), the path of
 the command line and of the service. Work is kept in `--work` and goes on where it stopped; what
@@ -50,6 +51,7 @@ BASELINES = (
     "constant-velocity",
 )
 JITTERS_M = (0.02, 0.05, 0.10)
+SAMPLES = 2000  # as the paper drew
 FEW_WINDOWS = 250  # of each set, every k-th: of what is compared along itself, not with others
 SCENES, REPEATS = 12, 5  # of each set, in the table of runtimes
 _QUICK_SCENES, _QUICK_REPEATS = 2, 1
@@ -70,6 +72,7 @@ class Options:
         data: the benchmark's folder; None for the environment's.
         work: where the work is kept.
         out: where the report goes.
+        samples: of each agent in the boxplots, Table 1 and kernel densities.
         quick: few windows, few samples: to see that all works, not to quote.
         seed: of everything random.
     """
@@ -82,6 +85,7 @@ class Options:
     work: Path
     out: Path
     quick: bool
+    samples: int = SAMPLES
     seed: int = 0
 
     @property
@@ -119,7 +123,7 @@ def plans(options: Options) -> dict[str, EvaluationPlan]:
         bootstrap=100 if options.quick else 1000,
     )
     thinned = replace(full, max_windows=4 if options.quick else FEW_WINDOWS)
-    many, some, few = (20, 20, 20) if options.quick else (2000, 100, 20)
+    many, some, few = (20, 20, 20) if options.quick else (options.samples, 100, 20)
     jittered = tuple(name for name in full.entries if name in (options.ours, *_JITTERED))
     found = {
         "table-1": replace(
@@ -335,6 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--models", default=",".join(BASELINES), help="that stand beside ours")
     parser.add_argument("--quick", action="store_true", help="few windows and samples")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="evaluations, without a report")
+    parser.add_argument("--samples", type=int, default=SAMPLES, help="in the paper's figures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path(".paper"))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/paper"))
@@ -348,6 +353,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         work=found.work,
         out=found.out,
         quick=found.quick,
+        samples=found.samples,
         seed=found.seed,
     )
     options.work.mkdir(parents=True, exist_ok=True)
