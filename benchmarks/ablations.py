@@ -1,7 +1,7 @@
 """What each part of the model and its training gains, on sites that were trained on and not.
 
     python -m benchmarks.ablations --work runs/ablations [--data path/to/eth_ucy] [--seeds 0 1]
-        [--variants default "no pace"] [--json benchmarks/results/ablations.json]
+        [--variants default "no dropout"] [--json benchmarks/results/ablations.json]
 
 Every variant differs from the default in one thing. All train on the training parts of Hotel,
 Zara1, Zara2 and Zara3 and are judged on the validation parts of these (known sites) and of ETH
@@ -13,9 +13,11 @@ parts belong to test recordings of other folds: see docs/model.md. A finished tr
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from tqdm import tqdm
 
 from trajectron_model.checkpoint import write_atomically
 from trajectron_model.data.eth_ucy import EthUcy
-from trajectron_model.training.settings import Preset, presets
+from trajectron_model.training.settings import Preset, TrainSettings, presets
 from trajectron_model.training.trainer import Progress, train
 from trajectron_model.training.validation import Validation, ValidationFigures
 
@@ -48,6 +50,8 @@ class Run:
     variant: str
     seed: int
     steps: int
+    key: str
+    """Of the settings and the data: another training never stands in for this one."""
     figures: Figures
 
 
@@ -78,11 +82,24 @@ def variants() -> dict[str, Preset]:
     }
 
 
-def measure(name: str, preset: Preset, seed: int, steps: int, data: EthUcy, folder: Path) -> Run:
-    """Trains one variant with one seed and judges what it ends with."""
-    settings = replace(
+def settings_of(preset: Preset, seed: int, steps: int) -> TrainSettings:
+    """How a variant is trained here."""
+    return replace(
         preset.train, steps=steps, validate_every=steps, seed=seed, threads=1, calibrate=False
     )
+
+
+def key_of(preset: Preset, seed: int, steps: int, data: EthUcy) -> str:
+    """What `Run.key` says."""
+    known = [data.part(one, "training").provenance for one in KNOWN]
+    judged = [data.part(one, "validation").provenance for one in chain(KNOWN, *UNSEEN.values())]
+    about = [preset.model.to_json(), settings_of(preset, seed, steps).to_json(), known, judged]
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def measure(name: str, preset: Preset, seed: int, steps: int, data: EthUcy, folder: Path) -> Run:
+    """Trains one variant with one seed and judges what it ends with."""
+    settings = settings_of(preset, seed, steps)
     training = [data.part(one, "training") for one in KNOWN]
     validation = [data.part(one, "validation") for one in KNOWN]
     with tqdm(total=steps, desc=f"{name}, seed {seed}", unit=" steps") as bar:
@@ -106,17 +123,17 @@ def measure(name: str, preset: Preset, seed: int, steps: int, data: EthUcy, fold
         parts = [data.part(one, "validation") for one in names]
         figures = Validation(parts, model, JUDGED_AGENTS).figures(model, settings.objective)
         found[group] = _named(figures)
-    return Run(name, seed, steps, found)
+    return Run(name, seed, steps, key_of(preset, seed, steps, data), found)
 
 
 def _named(figures: ValidationFigures) -> dict[str, float]:
     return {name: float(value) for name, value in figures._asdict().items()}
 
 
-def runs_of(work: Path, steps: int) -> list[Run]:
-    """All that is finished in a folder, with so many steps."""
+def runs_of(work: Path, wanted: Collection[str]) -> list[Run]:
+    """All that is finished in a folder, of these keys."""
     found = [Run(**json.loads(path.read_text())) for path in sorted(work.glob("*/figures.json"))]
-    return [run for run in found if run.steps == steps]
+    return [run for run in found if run.key in wanted]
 
 
 def table(runs: Sequence[Run]) -> str:
@@ -171,13 +188,17 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     data = EthUcy(options.data)
+    keys = set()
     for seed in options.seeds:
         for name in options.variants:
-            folder = options.work / f"{name.replace(' ', '-')}-{seed}-{options.steps}"
+            preset = variants()[name]
+            key = key_of(preset, seed, options.steps, data)
+            keys.add(key)
+            folder = options.work / key
             if not (folder / "figures.json").exists():
-                run = measure(name, variants()[name], seed, options.steps, data, folder)
+                run = measure(name, preset, seed, options.steps, data, folder)
                 write_atomically(folder / "figures.json", json.dumps(asdict(run)).encode())
-    runs = runs_of(options.work, options.steps)
+    runs = runs_of(options.work, keys)
     print(table(runs))
     if options.json:
         text = json.dumps([asdict(run) for run in runs], separators=(",", ":"))

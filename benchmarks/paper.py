@@ -253,8 +253,15 @@ def _recordings(options: Options) -> dict[str, Sequence[Recording]]:
 
 
 def _model(options: Options, test_set: str) -> Trajectron:
-    name = options.model if options.files else FAMILY.format(test_set=test_set)
-    return registry.load(name).model
+    return registry.load(_name(options, test_set)).model
+
+
+def _sha256(options: Options, test_set: str) -> str:
+    return registry.load(_name(options, test_set)).sha256
+
+
+def _name(options: Options, test_set: str) -> str:
+    return options.model if options.files else FAMILY.format(test_set=test_set)
 
 
 def _timings(
@@ -271,6 +278,7 @@ def _timings(
     try:
         for name, of in tqdm(recordings.items(), desc="runtime", unit=" sets", disable=None):
             about = [name, scenes, repeats, wanted, torch.__version__, runtime.processor()]
+            about += [runtime.VERSION, _sha256(options, name), *(r.source_sha256 for r in of)]
             key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:8]
             file = options.work / f"runtime-{name}-{key}.json"
             if file.exists():

@@ -34,6 +34,9 @@ from trajectron_model.forecast import ForecastRequest
 from trajectron_model.predictor import Predictor
 from trajectron_model.trajectron import Trajectron
 
+VERSION = 2
+"""Of what is timed: a change to it, or to the code's speed, makes timings kept before useless."""
+
 SAMPLES, OBSERVED, HORIZON = 200, 8, 12
 CHUNK_STEPS = 100
 REFERENCE = "Social GAN, one batched call"

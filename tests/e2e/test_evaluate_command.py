@@ -76,7 +76,7 @@ def test_a_model_and_constant_velocity_are_judged_side_by_side(
     assert run(*arguments, "--samples", "5", "--seed", "3", "--json", str(file)) == 0
     printed = capsys.readouterr().out
     content = json.loads(file.read_text())
-    assert "5 independent samples, seed 3" in printed
+    assert "5 samples, independent unless a row says stratified, seed 3" in printed
     assert "4 / 12" in printed  # windows and judged agents
     baseline, judged = content["rows"]
     assert (baseline["name"], judged["name"]) == ("constant-velocity", model)

@@ -1,10 +1,10 @@
 """An LSTM for each agent, the others unseen: the plain LSTM of Alahi et al. (CVPR 2016).
 
-As the paper's section 3.1 without its pooling: embedding of 64, hidden state of 128, a bivariate
-Gaussian out, the sampled position fed back in. Where it differs: displacements in place of
-positions, so that a forecast moves with the scene (as the public code of Social GAN has it), and
-the likelihood of every step from an agent's second on is trained, not of the foretold ones
-alone, so that short histories are met in training.
+As the paper's section 3.1 without its pooling: a bivariate Gaussian out, the sampled position
+fed back in. Where it differs: embedding of 32 and hidden state of 64, half of the paper's;
+displacements in place of positions, so that a forecast moves with the scene (as the public code
+of Social GAN has it); and the likelihood of every step from an agent's second on is trained, not
+of the foretold ones alone, so that short histories are met in training.
 """
 
 from __future__ import annotations

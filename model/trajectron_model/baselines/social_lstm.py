@@ -3,12 +3,11 @@
 An LSTM for each agent. At every step the hidden states of the others are summed over the cells
 of a grid around it (the social tensor H, equation 1), embedded (a, equation 2), and fed to the
 LSTM beside the embedded step (r and equation 3); a bivariate Gaussian comes out (equation 4).
-Sizes are the paper's: embeddings of 64, hidden state of 128, a grid of 4 x 4 cells (a pooling
-size of 32 with 8 x 8 windows).
+The grid has the paper's 4 x 4 cells (a pooling size of 32 with 8 x 8 windows).
 
-Where it differs: displacements in place of positions, as in `lstm`; the paper's pooling size is
-in pixels of each video, here the grid is 4 m wide, which with 1 m cells is about what its
-figures show; Adam in place of RMSprop.
+Where it differs: embeddings of 32 and a hidden state of 64, half of the paper's; displacements in
+place of positions, as in `lstm`; the paper's pooling size is in pixels of each video, here the
+grid is 4 m wide, which with 1 m cells is about what its figures show; Adam in place of RMSprop.
 
 Shape letters: S samples, N agents, E ordered pairs, C cells, D hidden size.
 """

@@ -99,7 +99,8 @@ def _scores(
     columns |= _sample_columns(distance[: how.samples], window.in_best_of, how)
     columns |= _density_columns(window, forecast, truth, how)
     paired = forecast.samples[: min(how.samples, PAIRED_SAMPLES)]
-    columns["energy"] = metrics.energy_score(paired, truth)
+    if how.independent:
+        columns["energy"] = metrics.energy_score(paired, truth)
     columns["collision"] = metrics.collision_share(paired, window.history()[:, -1])
     if log_prob is not None:
         columns["nll_exact"] = -log_prob

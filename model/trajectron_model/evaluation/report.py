@@ -84,7 +84,8 @@ def facts(evaluation: Evaluation) -> dict[str, str]:
             for one in fingerprint.sets
         ),
         "Windows": fingerprint.selection,
-        "Samples": f"{plan.samples} of each agent, independent, seed {plan.seed}; "
+        "Samples": f"{plan.samples} of each agent, independent unless a row says stratified, "
+        f"seed {plan.seed}; "
         f"{fingerprint.kde_samples} in kernel density estimates",
         "Intervals": f"{plan.bootstrap} resamplings of windows",
     }

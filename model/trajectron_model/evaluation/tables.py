@@ -29,7 +29,7 @@ def heading(fingerprint: Fingerprint) -> str:
     plan = fingerprint.plan
     parts = [
         f"Protocol {plan.protocol}: {fingerprint.horizon} steps of {fingerprint.dt_s:g} s foretold",
-        f"{plan.samples} independent samples, seed {plan.seed}",
+        f"{plan.samples} samples, independent unless a row says stratified, seed {plan.seed}",
         f"{fingerprint.kde_samples} in kernel density estimates",
     ]
     if fingerprint.selection != "all":
