@@ -173,6 +173,25 @@ def test_horizon_steps_have_figures_of_their_own(stand: Stand, square: str, tmp_
     assert row.sets[0].scores.by_step.keys() == row.mean.by_step.keys()
 
 
+def test_a_step_unknown_in_one_set_moves_no_figure_of_another(stand: Stand, tmp_path: Path) -> None:
+    """Both stand for the 8 observed steps, then walk 1 m a step; one is unseen at the third."""
+
+    def write(name: str, unseen: Sequence[int]) -> str:
+        file = tmp_path / name
+        rows = [f"{10 * t}\t1\t{1 + max(0, t - 7)}.0\t1.0\n" for t in range(21) if t not in unseen]
+        file.write_text("".join(rows))
+        return str(file)
+
+    files = write("whole.txt", ()), write("gap.txt", (7 + 3,))
+    stand(model=ConstantVelocity())
+    evaluation = run.run(plan(*files, protocol="paper", samples=2), tmp_path / "work")
+    lines = [line.split(",") for line in evaluation.to_csv().splitlines()]
+    for over in ("mean", "pooled"):
+        found = {line[4]: line[5] for line in lines if line[1:4] == [over, "", "distance_mode"]}
+        del found[""]  # the figure over all steps
+        assert found == {f"{step}": f"{step}.0" for step in range(1, 13) if step != 3}
+
+
 def test_sets_weigh_alike_in_the_mean_and_agents_in_the_pool(stand: Stand, tmp_path: Path) -> None:
     files = write_square(tmp_path / "a.txt", 27), write_square(tmp_path / "b.txt", 23)
     stand(model={"a": Drifting([[1.0, 3.0]]), "b": Drifting([[6.0, 6.0]])})

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from trajectron_model.evaluation import metrics
 from trajectron_model.evaluation.metrics import (
     Float,
     average_displacement,
@@ -187,3 +190,45 @@ def test_who_stands_still_beside_another_at_a_tenth_of_a_metre_has_not_collided(
 
 def test_nobody_collides_alone() -> None:
     assert np.isnan(collision_share(np.zeros((3, 1, 2, 2)), np.zeros((1, 2)))).all()
+
+
+def crowd(agents: int, samples: int = 20) -> tuple[Float, Float]:
+    """Sampled paths [S, A, 6, 2] of people who jostle in a square, and where they are [A, 2]."""
+    random = np.random.default_rng(0)
+    now = random.uniform(0.0, 3.0, (agents, 2))
+    steps = random.normal(0.0, 0.3, (samples, agents, 6, 2))
+    return now[:, None] + steps.cumsum(axis=2), now
+
+
+@pytest.mark.parametrize("pairs_at_a_time", [0, 1, 4, 7, 1000])
+def test_collisions_do_not_depend_on_how_the_pairs_are_cut(
+    monkeypatch: pytest.MonkeyPatch, pairs_at_a_time: int
+) -> None:
+    samples, now = crowd(9)
+    monkeypatch.setattr(metrics, "_CELLS", pairs_at_a_time * 20 * 7 * 2)
+    share = collision_share(samples, now)
+    each = [
+        [collision_share(samples[:, [one, other]], now[[one, other]])[0] for other in range(9)
+         if other != one]
+        for one in range(9)
+    ]  # fmt: skip
+    np.testing.assert_allclose(share, np.mean(each, axis=1), rtol=1e-12)
+    assert share.any()
+
+
+def peak_memory(agents: int) -> int:
+    """Bytes that counting the collisions of a crowd takes beside its samples."""
+    samples, now = crowd(agents)
+    tracemalloc.start()
+    try:
+        collision_share(samples, now)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_collisions_in_a_crowd_take_bounded_memory() -> None:
+    """All 44,850 pairs of 300 people at once would be 100 MB an array."""
+    few, many = peak_memory(100), peak_memory(300)  # nine times the pairs
+    assert many < 20e6
+    assert many < 1.5 * few

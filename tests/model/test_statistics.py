@@ -60,9 +60,32 @@ def test_a_set_of_many_weighs_as_one_of_few_in_the_mean_but_not_in_the_pool() ->
 
 def test_a_metric_that_a_set_lacks_has_no_mean_over_sets() -> None:
     one = sample(scores([0, 1], error=[1.0, 2.0], density=[0.5, 0.5]), 2)
-    other = sample(scores([0, 1], error=[1.0, 2.0]), 2)
-    assert statistics.mean_of_sets([one, other]).metrics.keys() == {"error"}
-    assert statistics.pooled([other, one]).metrics.keys() == {"error"}
+    without = sample(scores([0, 1], error=[1.0, 2.0]), 2)
+    undefined = sample(scores([0, 1], error=[1.0, 2.0], density=[NAN, NAN]), 2)
+    for other in (without, undefined):
+        for sets in ([one, other], [other, one]):
+            assert statistics.mean_of_sets(sets).metrics.keys() == {"error"}
+            assert statistics.pooled(sets).metrics.keys() == {"error"}
+
+
+def test_a_step_that_a_set_lacks_has_no_figure_and_moves_no_other() -> None:
+    whole = sample(scores([0, 1], distance=[[10.0, 20.0, 30.0, 40.0]] * 2), 2)
+    gap = sample(scores([0, 1], distance=[[1.0, 2.0, NAN, 4.0]] * 2), 2)
+    for sets in ([whole, gap], [gap, whole]):
+        for over in (statistics.mean_of_sets, statistics.pooled):
+            steps = over(sets).by_step["distance"]
+            assert [None if one is None else (one.value, one.agents) for one in steps] == [
+                (5.5, 4), (11.0, 4), None, (22.0, 4),
+            ]  # fmt: skip
+
+
+def test_sets_without_a_step_in_common_have_no_figures_by_step() -> None:
+    first = sample(scores([0, 1], distance=[[1.0, NAN]] * 2), 2)
+    second = sample(scores([0, 1], distance=[[NAN, 3.0]] * 2), 2)
+    for over in (statistics.mean_of_sets, statistics.pooled):
+        found = over([first, second])
+        assert found.metrics["distance"].value == 2.0
+        assert not found.by_step
 
 
 def test_a_group_in_few_windows_has_an_interval_all_the_same() -> None:

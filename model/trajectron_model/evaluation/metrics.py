@@ -2,10 +2,14 @@
 
 Truth that is not known is NaN, at the same steps for every sample of an agent.
 
-Shape letters: S samples, A agents of one window, H horizon steps, Z modes, G groups of samples.
+Shape letters: S samples, A agents of one window, H horizon steps, Z modes, G groups of samples,
+P pairs of agents.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +24,9 @@ BRIER_MODES = 5
 
 COLLISION_DISTANCE_M = 0.1
 """Two agents nearer than this have collided."""
+
+_CELLS = 250_000
+"""Coordinates of pairs held at a time: 2 MB an array."""
 
 
 def displacement(forecast: NDArray[np.floating], truth: Float) -> Float:
@@ -221,17 +228,37 @@ def collision_share(samples: NDArray[np.floating], now: Float) -> Float:
     agents = samples.shape[1]
     if agents < 2:
         return np.full(agents, np.nan)
-    first, second = np.triu_indices(agents, k=1)
     start = np.broadcast_to(now, (len(samples), agents, 2))[:, :, None]  # [S, A, 1, 2]
     paths = np.concatenate([start, samples], axis=2)  # [S, A, H + 1, 2]
-    offset = paths[:, first] - paths[:, second]  # [S, P, H + 1, 2]
+    collisions = np.zeros(agents, dtype=np.int64)
+    for pairs in _runs_of_pairs(agents, max(1, _CELLS // paths[:, 0].size)):
+        offset = paths[:, pairs[:, 0]] - paths[:, pairs[:, 1]]  # [S, P, H + 1, 2]
+        collided = (_square_gap(offset) < COLLISION_DISTANCE_M**2).any(axis=2)  # [S, P]
+        np.add.at(collisions, pairs, collided.sum(axis=0)[:, None])
+    share: Float = collisions / (len(samples) * (agents - 1))
+    return share
+
+
+def _runs_of_pairs(agents: int, length: int) -> Iterator[NDArray[np.int64]]:
+    """[P, 2] indices of two agents: every pair once, at most ``length`` of them at a time."""
+    pairs = combinations(range(agents), 2)
+    while run := list(islice(pairs, length)):
+        yield np.array(run)
+
+
+def _square_gap(offset: Float) -> Float:
+    """How near two come who walk straight from step to step.
+
+    Args:
+        offset: [S, P, H + 1, 2] metres, from one to the other at every step.
+
+    Returns:
+        [S, P, H] square metres, between each step and the next.
+    """
     begin, stride = offset[:, :, :-1], np.diff(offset, axis=2)  # [S, P, H, 2]
     length = np.einsum("sphi,sphi->sph", stride, stride)
     along = -np.einsum("sphi,sphi->sph", begin, stride)
     nearest_at = np.divide(along, length, out=np.zeros_like(along), where=length > 0.0)
     nearest = begin + np.clip(nearest_at, 0.0, 1.0)[..., None] * stride
-    gap = np.einsum("sphi,sphi->sph", nearest, nearest)  # square metres
-    collided = (gap < COLLISION_DISTANCE_M**2).any(axis=2).mean(axis=0)  # [P]
-    total = np.bincount(first, collided, agents) + np.bincount(second, collided, agents)
-    share: Float = total / (agents - 1)
-    return share
+    gap: Float = np.einsum("sphi,sphi->sph", nearest, nearest)
+    return gap

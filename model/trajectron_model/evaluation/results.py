@@ -36,9 +36,10 @@ class Scores:
     """The estimates of one group of agents.
 
     Attributes:
-        metrics: by the metric's name; metrics that are defined for nobody are left out.
+        metrics: by the metric's name; metrics that are defined for nobody are left out, and
+            over several sets those that are for nobody of some set.
         by_step: the metrics that have a value for every horizon step, [H] each; a step at
-            which nobody's truth is known has None.
+            which nobody's truth is known, or nobody's of some set, has None.
     """
 
     metrics: Mapping[str, Estimate]

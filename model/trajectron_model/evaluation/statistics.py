@@ -114,9 +114,11 @@ class Sample:
 def pooled(samples: Sequence[Sample]) -> Scores:
     """The scores of all agents of several sets, each agent weighing the same."""
     columns = _common(samples)
-    total = np.sum([_pick(sample, columns).total for sample in samples], axis=0)
-    count = np.sum([_pick(sample, columns).count for sample in samples], axis=0)
-    return Sample(columns, total, count).scores()
+    picked = [_pick(sample, columns) for sample in samples]
+    total = np.sum([sample.total for sample in picked], axis=0)
+    count = np.sum([sample.count for sample in picked], axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _scores(columns, total / count, _agents(picked))
 
 
 def mean_of_sets(samples: Sequence[Sample]) -> Scores:
@@ -127,7 +129,7 @@ def mean_of_sets(samples: Sequence[Sample]) -> Scores:
         each = np.stack([sample.total / sample.count for sample in picked])  # [sets, 1 + B, C]
     # A resampling that has nobody of a set's group says nothing of that set.
     means = mean_over_known(each, axis=0)
-    return _scores(columns, means, np.sum([sample.count[0] for sample in picked], axis=0))
+    return _scores(columns, means, _agents(picked))
 
 
 def resample(windows: int, times: int, seed: int, name: str) -> Float:
@@ -192,12 +194,14 @@ def paired_t_test(first: Float, second: Float) -> PairedTest | None:
 
 
 def _common(samples: Sequence[Sample]) -> tuple[Column, ...]:
-    """The columns that all samples have and that are defined for someone in each of them."""
-    defined = [
-        {column for column, n in zip(sample.columns, sample.count[0], strict=True) if n}
-        for sample in samples
-    ]
-    return tuple(c for c in samples[0].columns if all(c in one for one in defined))
+    """The columns that all samples have."""
+    return tuple(c for c in samples[0].columns if all(c in one.columns for one in samples))
+
+
+def _agents(samples: Sequence[Sample]) -> Float:
+    """[C] how many agents a column is defined for; 0 where it is for nobody in some sample."""
+    each = np.stack([sample.count[0] for sample in samples])  # [sets, C]
+    return np.where(each.all(axis=0), each.sum(axis=0), 0.0)
 
 
 def _pick(sample: Sample, columns: Sequence[Column]) -> Sample:
@@ -207,7 +211,7 @@ def _pick(sample: Sample, columns: Sequence[Column]) -> Sample:
 
 
 def _scores(columns: Sequence[Column], means: Float, count: Float) -> Scores:
-    """Estimates from means [1 + B, C] and counts of agents [C]."""
+    """Estimates from means [1 + B, C] and counts of agents [C], 0 for no estimate."""
     defined = np.flatnonzero(count)
     resampled = means[1:, defined]
     # A resampling can miss everyone whom a metric is defined for: it says nothing then.
@@ -224,7 +228,7 @@ def _scores(columns: Sequence[Column], means: Float, count: Float) -> Scores:
     for column in columns:
         if column.step is not None and column.metric in metrics:
             steps.setdefault(column.metric, []).append(found.get(column))
-    return Scores(metrics, {metric: tuple(each) for metric, each in steps.items()})
+    return Scores(metrics, {name: tuple(each) for name, each in steps.items() if any(each)})
 
 
 def _rounded(value: float) -> float:
