@@ -6,6 +6,8 @@ import asyncio
 import json
 import os
 import signal
+import sqlite3
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,9 +15,11 @@ from typing import Any
 
 import pytest
 from tests.contract.recordings import walkers
+from tests.contract.servers import save_small_model
 
+from trajectron_model import registry
 from trajectron_service.errors import ErrorKind, ServiceError
-from trajectron_service.evaluations import queue
+from trajectron_service.evaluations import queue, worker
 from trajectron_service.evaluations.background import Background, told
 from trajectron_service.evaluations.folders import EvaluationFolder
 from trajectron_service.evaluations.jobs import Evaluations
@@ -30,12 +34,14 @@ from trajectron_service.evaluations.messages import (
 )
 from trajectron_service.evaluations.requests import EvaluationChoices
 from trajectron_service.evaluations.running import FailedError
+from trajectron_service.evaluations.store import EvaluationStore, StoredEvaluation
 from trajectron_service.metrics import Metrics
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.work import WorkInHand
 
 Run = Callable[[EvaluationFolder, Callable[[EvaluationProgress], object]], Any]
 
+WAIT_S = 30.0
 ASKED = EvaluationConfig(models=("constant-velocity",), dataset="eth_ucy", sets=("street",))
 DATA = {
     "seconds_per_frame": 0.04,
@@ -246,6 +252,265 @@ async def test_a_client_that_goes_away_leaves_no_files_behind(
         assert evaluations._entering == 0
 
 
+class Gate:
+    """Lets a thread pass once it is opened, and tells the event loop when one has come."""
+
+    def __init__(self) -> None:
+        self._reached = threading.Event()
+        self._opened = threading.Event()
+
+    def pass_through(self) -> None:
+        """Waits until the gate is opened."""
+        self._reached.set()
+        assert self._opened.wait(WAIT_S)
+
+    def open(self) -> None:
+        """Lets everybody through from now on."""
+        self._opened.set()
+
+    async def reached(self) -> None:
+        """Returns when a thread has come."""
+        assert await asyncio.to_thread(self._reached.wait, WAIT_S)
+
+
+@pytest.fixture
+def before_fill(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    """Closed to whoever lays down an evaluation's files."""
+    gate, fill = Gate(), EvaluationFolder.fill
+
+    def fill_behind(folder: EvaluationFolder, *what: Any) -> None:
+        gate.pass_through()
+        fill(folder, *what)
+
+    monkeypatch.setattr(EvaluationFolder, "fill", fill_behind)
+    return gate
+
+
+@pytest.fixture
+def before_record(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    """Closed to whoever writes a new record."""
+    gate, add = Gate(), EvaluationStore.add
+
+    async def add_behind(store: EvaluationStore, stored: StoredEvaluation) -> None:
+        await store._on_thread(gate.pass_through)
+        await add(store, stored)
+
+    monkeypatch.setattr(EvaluationStore, "add", add_behind)
+    return gate
+
+
+def folders(settings: Settings) -> list[str]:
+    """The folders of evaluations that there are."""
+    assert settings.state_dir is not None
+    return sorted(path.name for path in (settings.state_dir / "evaluations").iterdir())
+
+
+async def test_files_being_laid_down_for_a_client_that_goes_away_are_removed_after_that(
+    settings: Settings, carried: Callable[[Run], None], before_fill: Gate
+) -> None:
+    carried(forever)
+    async with opened(settings) as evaluations:
+        creating = asyncio.create_task(create(evaluations, "a"))
+        await before_fill.reached()
+        next_one = asyncio.create_task(create(evaluations, "b"))
+        creating.cancel()
+        await asyncio.sleep(0.05)
+        creating.cancel()  # whoever insists has to wait as well
+        before_fill.open()
+        with pytest.raises(asyncio.CancelledError):
+            await creating
+        await next_one
+        assert folders(settings) == ["00000002"]
+
+
+async def test_a_stop_waits_for_the_files_of_a_client_that_has_gone_away(
+    settings: Settings, before_fill: Gate
+) -> None:
+    async with opened(settings) as evaluations:
+        creating = asyncio.create_task(create(evaluations, "a"))
+        await before_fill.reached()
+        creating.cancel()
+        asyncio.get_running_loop().call_later(0.05, before_fill.open)
+    assert folders(settings) == []
+    assert creating.cancelled()
+
+
+async def test_recordings_that_take_too_long_are_refused_and_leave_no_files(
+    settings: Settings, before_fill: Gate
+) -> None:
+    async with opened(settings.model_copy(update={"request_timeout_s": 0.05})) as evaluations:
+        creating = asyncio.create_task(create(evaluations, "a"))
+        asyncio.get_running_loop().call_later(0.2, before_fill.open)
+        with pytest.raises(ServiceError) as caught:
+            await creating
+        assert caught.value.kind is ErrorKind.DEADLINE_EXCEEDED
+        assert folders(settings) == []
+
+
+async def test_a_request_cut_off_while_it_is_recorded_makes_its_one_evaluation(
+    settings: Settings, carried: Callable[[Run], None], before_record: Gate
+) -> None:
+    carried(forever)
+    async with opened(settings) as evaluations:
+        creating = asyncio.create_task(evaluations.create("", ASKED, (), "key"))
+        await before_record.reached()
+        creating.cancel()
+        again = asyncio.create_task(evaluations.create("", ASKED, (), "key"))
+        other = asyncio.create_task(create(evaluations, "other"))
+        await asyncio.sleep(0.05)
+        before_record.open()
+        with pytest.raises(asyncio.CancelledError):
+            await creating
+        kept, _ = await evaluations.list_page(None, "")
+        assert [info.id for info in kept] == [(await again).id]
+        await other
+        assert folders(settings) == ["00000001", "00000002"]
+    async with opened(settings) as evaluations:
+        kept, _ = await evaluations.list_page(None, "")
+        assert [info.id for info in kept] == ["other", (await again).id]
+
+
+async def test_an_evaluation_that_cannot_be_recorded_leaves_no_files(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with opened(settings) as evaluations:
+        monkeypatch.setattr(EvaluationStore, "add", full_disk)
+        with pytest.raises(sqlite3.OperationalError):
+            await create(evaluations, "a")
+        assert folders(settings) == []
+        assert await evaluations.list_page(None, "") == ((), "")
+
+
+async def full_disk(_store: EvaluationStore, _stored: StoredEvaluation) -> None:
+    """As the store fails on a full disk."""
+    raise sqlite3.OperationalError("database or disk is full")
+
+
+async def test_what_is_created_while_another_is_being_deleted_has_its_own_files(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    ending, ended = asyncio.Event(), asyncio.Event()
+
+    async def end_slowly(_folder: EvaluationFolder, _note: object) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ending.set()
+            await ended.wait()
+
+    carried(end_slowly)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.RUNNING)
+        deleting = asyncio.create_task(evaluations.delete("a"))
+        await ending.wait()
+        await create(evaluations, "a")  # the id is free as soon as the record is gone
+        ended.set()
+        await deleting
+        assert folders(settings) == ["00000002"]
+        assert (await evaluations.get("a")).state is not EvaluationState.SUCCEEDED
+
+
+async def test_an_id_is_taken_until_its_record_is_gone(
+    settings: Settings, carried: Callable[[Run], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carried(at_once)
+    gate, delete = Gate(), EvaluationStore.delete
+
+    async def delete_behind(store: EvaluationStore, stored: StoredEvaluation) -> None:
+        await store._on_thread(gate.pass_through)
+        await delete(store, stored)
+
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.SUCCEEDED)
+        monkeypatch.setattr(EvaluationStore, "delete", delete_behind)
+        deleting = asyncio.create_task(evaluations.delete("a"))
+        await gate.reached()
+        for ask, kind in (
+            (create(evaluations, "a"), ErrorKind.EVALUATION_EXISTS),
+            (evaluations.get("a"), ErrorKind.UNKNOWN_EVALUATION),
+            (evaluations.delete("a"), ErrorKind.UNKNOWN_EVALUATION),
+        ):
+            with pytest.raises(ServiceError) as caught:
+                await ask
+            assert caught.value.kind is kind
+        gate.open()
+        await deleting
+        await create(evaluations, "a")
+
+
+async def test_what_cannot_be_deleted_stays_and_goes_on(
+    settings: Settings, carried: Callable[[Run], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    release = asyncio.Event()
+
+    async def wait(folder: EvaluationFolder, note: Callable[[EvaluationProgress], object]) -> None:
+        await release.wait()
+        await at_once(folder, note)
+
+    carried(wait)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.RUNNING)
+        watching = evaluations.watch("a")
+        assert (await anext(watching)).state is EvaluationState.RUNNING
+        with monkeypatch.context() as patch:
+            patch.setattr(EvaluationStore, "delete", full_disk)
+            with pytest.raises(sqlite3.OperationalError):
+                await evaluations.delete("a")
+        release.set()
+        async with asyncio.timeout(WAIT_S):
+            states = [info.state async for info in watching]
+        assert states[-1] is EvaluationState.SUCCEEDED
+        await evaluations.delete("a")
+        assert folders(settings) == []
+
+
+async def test_who_watches_is_told_though_files_cannot_be_deleted(
+    settings: Settings, carried: Callable[[Run], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: EvaluationFolder) -> None:
+        raise PermissionError(folder.path)
+
+    carried(forever)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+        await until(evaluations, "a", EvaluationState.RUNNING)
+        watching = evaluations.watch("a")
+        assert (await anext(watching)).state is EvaluationState.RUNNING
+        with monkeypatch.context() as patch:
+            patch.setattr(EvaluationFolder, "remove", refuse)
+            with pytest.raises(PermissionError):
+                await evaluations.delete("a")
+        with pytest.raises(ServiceError) as caught:
+            async with asyncio.timeout(WAIT_S):
+                await anext(watching)
+        assert caught.value.kind is ErrorKind.UNKNOWN_EVALUATION
+        await create(evaluations, "b")
+        assert folders(settings) == ["00000001", "00000002"]
+    async with opened(settings):
+        assert folders(settings) == ["00000002"]  # the files left behind are swept up
+
+
+async def test_what_is_created_before_the_start_is_done_waits_for_what_is_kept(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(at_once)
+    async with opened(settings) as evaluations:
+        await create(evaluations, "a")
+    metrics = Metrics()
+    evaluations = Evaluations(settings, metrics, WorkInHand(metrics))
+    creating = asyncio.create_task(create(evaluations, "b"))
+    await asyncio.sleep(0.05)
+    await evaluations.start()
+    try:
+        await creating
+        assert folders(settings) == ["00000001", "00000002"]
+    finally:
+        await evaluations.close()
+
+
 async def test_no_more_are_kept_than_may_be(
     settings: Settings, carried: Callable[[Run], None]
 ) -> None:
@@ -317,9 +582,44 @@ def test_a_served_model_is_judged_by_its_own_files(settings: Settings, tmp_path:
     names = ("mine@z_best", "mine", "eth_ucy", "eth_ucy-without-eth@stratified")
     config = EvaluationConfig(models=names, dataset="eth_ucy")
     resolved = choices.resolve(config, ())
-    # A path, for a bundled model of the same name would be taken instead.
-    assert choices.plan(resolved, ()).entries == (names[0], "mine", "./eth_ucy", names[3])
+    # Paths, for a bundled model or a baseline of the same name would be taken instead.
+    assert choices.plan(resolved, ()).entries == (
+        "./mine@z_best", "./mine", "./eth_ucy", "eth_ucy-without-eth@stratified",
+    )  # fmt: skip
     assert choices.model_files(resolved) == mine
+
+
+@pytest.mark.parametrize("name", ["eth_ucy", "constant-velocity"])
+def test_a_served_model_of_a_bundled_name_has_its_results_under_the_name_asked_for(
+    settings: Settings,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    stem = save_small_model(tmp_path / name)
+    choices = EvaluationChoices(settings, {name: stem})
+    asked = EvaluationConfig(models=(name, "kalman"), num_samples=3, in_sample=True)
+    file = RecordingFile("square.csv", walkers())
+    config = choices.resolve(asked, (file,))
+    folder = EvaluationFolder(tmp_path / "evaluation")
+    plan = choices.plan(config, (file.name,)).to_json()
+    folder.fill(plan, (file,), choices.model_files(config))
+    monkeypatch.chdir(folder.work)
+    assert worker.main(folder.run, None) == 0
+
+    result = json.loads(folder.result(ResultFormat.JSON).content)
+    assert [row["name"] for row in result["rows"]] == [name, "kalman"]
+    assert result["rows"][0]["sets"][0]["model_sha256"] == registry.describe(stem).sha256
+    assert result["fingerprint"]["plan"]["entries"] == [name, "kalman"]
+    assert {(one["first"], one["second"]) for one in result["comparisons"]} == {(name, "kalman")}
+    lines = folder.result(ResultFormat.CSV).content.decode().splitlines()[1:]
+    assert {line.split(",")[0] for line in lines} == {name, "kalman"}
+    assert f"./{name}".encode() not in folder.result(ResultFormat.HTML).content
+    told_of = [
+        json.loads(line)["progress"]["entry"] for line in capfd.readouterr().out.splitlines()
+    ]
+    assert set(told_of) <= {name, "kalman"} and told_of[0] == name
 
 
 async def test_a_module_that_fails_leaves_its_reason_in_the_log(tmp_path: Path) -> None:

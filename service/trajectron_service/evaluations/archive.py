@@ -68,15 +68,28 @@ class Archive:
             if path not in known:
                 EvaluationFolder(path).remove()
 
-    async def save(self, stored: StoredEvaluation) -> None:
-        """Writes a record, new or changed; on return it is on the disk."""
-        await self._store.save(stored)
+    async def add(self, stored: StoredEvaluation) -> None:
+        """Writes the record of files that are there, or removes them where it cannot."""
+        try:
+            await self._store.add(stored)
+        except BaseException:
+            await self.remove_files(stored)
+            raise
 
-    async def delete(self, stored: StoredEvaluation) -> None:
-        """Removes an evaluation with its files."""
-        # Files without a record are swept up at the next start; a record without its files
-        # would be an evaluation that cannot be carried out.
+    async def change(self, stored: StoredEvaluation) -> None:
+        """Writes a changed record, unless it has been removed; on return it is on the disk."""
+        await self._store.change(stored)
+
+    async def remove_record(self, stored: StoredEvaluation) -> None:
+        """Removes a record.
+
+        It goes before its files do: those without a record are swept up at the next start; a
+        record without its files would be an evaluation that cannot be carried out.
+        """
         await self._store.delete(stored)
+
+    async def remove_files(self, stored: StoredEvaluation) -> None:
+        """Removes the files of an evaluation, which nobody uses."""
         await asyncio.to_thread(self.folder(stored.number).remove)
 
     async def close(self) -> None:

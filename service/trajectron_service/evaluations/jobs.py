@@ -84,6 +84,8 @@ class Evaluations:
         )
         # Recordings are read one request after the other.
         self._entrance = asyncio.Lock()
+        # Before the start nobody knows which ids and numbers are taken.
+        self._started = asyncio.Event()
         self._entering = 0
 
     async def start(self) -> None:
@@ -96,6 +98,7 @@ class Evaluations:
             await self._queue.start()
         except StoreError as error:
             raise SettingsError(f"state_dir: {error}") from error
+        self._started.set()
 
     def begin_drain(self) -> None:
         """Ends what watches; the work in hand refuses all else."""
@@ -106,8 +109,10 @@ class Evaluations:
     async def close(self) -> None:
         """Ends what runs, to be taken up at the next start, and closes the archive."""
         self.begin_drain()
-        await self._queue.close()
-        await self._archive.close()
+        # Whoever was cut off while entering has files to remove.
+        async with self._entrance:
+            await self._queue.close()
+            await self._archive.close()
 
     async def create(
         self,
@@ -143,7 +148,8 @@ class Evaluations:
             self._check_room()
             self._entering += 1
             try:
-                async with self._entrance, asyncio.timeout(self._settings.request_timeout_s):
+                await self._started.wait()
+                async with self._entrance:
                     return await self._enter(blank, files, request_id, sha256)
             except TimeoutError:
                 raise ServiceError(
@@ -160,25 +166,30 @@ class Evaluations:
         before = self._of_request(request_id, sha256)
         if before is not None:
             return before
-        if self._queue.get(info.id) is not None:
+        if self._queue.has_record(info.id):
             raise ServiceError(
                 ErrorKind.EVALUATION_EXISTS, f"evaluation_id: {quoted(info.id)} is taken"
             )
-        stored = StoredEvaluation(self._queue.next_number, TENANT, info, request_id, sha256)
-        folder = self._archive.folder(stored.number)
-        config = info.config
+        stored = StoredEvaluation(self._queue.take_number(), TENANT, info, request_id, sha256)
         try:
-            plan = self._choices.plan(config, info.files).to_json()
-            models = self._choices.model_files(config)
-            await asyncio.to_thread(folder.fill, plan, files, models)
-            if files:
-                assert config.frames_per_step is not None  # resolved
-                await check_recordings(folder, info.files, config.frames_per_step, self._background)
+            async with asyncio.timeout(self._settings.request_timeout_s):
+                await self._lay_down(stored, files)
         except BaseException:
-            await self._queue.whole(asyncio.to_thread(folder.remove))
+            await self._queue.whole(self._archive.remove_files(stored))
             raise
         await self._queue.add(stored)
         return info
+
+    async def _lay_down(self, stored: StoredEvaluation, files: Sequence[RecordingFile]) -> None:
+        """Writes all that an evaluation needs, and sees whether its recordings can be read."""
+        folder, info = self._archive.folder(stored.number), stored.info
+        plan = self._choices.plan(info.config, info.files).to_json()
+        models = self._choices.model_files(info.config)
+        await self._queue.whole(asyncio.to_thread(folder.fill, plan, files, models))
+        if files:
+            frames_per_step = info.config.frames_per_step
+            assert frames_per_step is not None  # resolved
+            await check_recordings(folder, info.files, frames_per_step, self._background)
 
     async def get(self, identity: str) -> EvaluationInfo:
         """An evaluation as it is now."""

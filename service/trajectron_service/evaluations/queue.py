@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import itertools
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from typing import Any, TypeVar
@@ -35,7 +36,7 @@ class Job:
         changed: set, and replaced, whenever something has changed.
         task: what carries it out, None while nothing does.
         halted: never to be started (again).
-        removed: deleted; whoever still holds it sees that.
+        removed: deleted, or about to be; whoever still holds it sees that.
     """
 
     def __init__(self, stored: StoredEvaluation) -> None:
@@ -94,6 +95,7 @@ class EvaluationQueue:
         self._metrics = metrics
         self._clock = clock
         self._jobs: dict[str, Job] = {}
+        self._numbers = itertools.count(1)
         self._running: set[Job] = set()
         self._finishing: set[asyncio.Task[Any]] = set()
         self._closing = False
@@ -102,21 +104,25 @@ class EvaluationQueue:
         return len(self._jobs)
 
     def __iter__(self) -> Iterator[Job]:
-        return iter(self._jobs.values())
+        return (job for job in self._jobs.values() if not job.removed)
 
     def get(self, identity: str) -> Job | None:
         """An evaluation by its id, None when there is none."""
-        return self._jobs.get(identity)
+        job = self._jobs.get(identity)
+        return None if job is None or job.removed else job
+
+    def has_record(self, identity: str) -> bool:
+        """Whether an id is taken, if only by an evaluation that is about to be deleted."""
+        return identity in self._jobs
 
     @property
     def waiting(self) -> int:
         """How many wait for their turn."""
         return sum(job.waits for job in self)
 
-    @property
-    def next_number(self) -> int:
-        """The number of the next evaluation to be added."""
-        return 1 + max((job.stored.number for job in self), default=0)
+    def take_number(self) -> int:
+        """A number for a new evaluation: nobody else gets it, even if nothing comes of it."""
+        return next(self._numbers)
 
     async def start(self) -> None:
         """Takes up what was queued or running when the service ended.
@@ -126,6 +132,8 @@ class EvaluationQueue:
         """
         for stored in await self._archive.load():
             self._jobs[stored.info.id] = Job(_queued_again(stored))
+        last = max((job.stored.number for job in self), default=0)
+        self._numbers = itertools.count(last + 1)
         for state in EvaluationState:
             gauge = self._metrics.evaluations.labels(state.value)
             gauge.set_function(partial(self._count, state))
@@ -144,7 +152,7 @@ class EvaluationQueue:
         await self.whole(self._add(stored))
 
     async def _add(self, stored: StoredEvaluation) -> None:
-        await self._archive.save(stored)
+        await self._archive.add(stored)
         self._jobs[stored.info.id] = Job(stored)
         self._pump()
 
@@ -159,22 +167,41 @@ class EvaluationQueue:
             await self._finish(job, EvaluationState.CANCELLED)
 
     async def remove(self, job: Job) -> None:
-        """Removes an evaluation and its files, after having ended it."""
+        """Removes an evaluation, ends it, and removes its files.
+
+        One whose record cannot be removed stays, and goes on.
+        """
         job.removed = True
-        del self._jobs[job.info.id]
         await self.whole(self._remove(job))
 
     async def _remove(self, job: Job) -> None:
+        try:
+            await self._archive.remove_record(job.stored)
+            del self._jobs[job.info.id]
+        except BaseException:
+            job.removed = False
+            self._pump()  # it may have been passed over meanwhile
+            raise
+        finally:
+            job.tell()
         await self._halt(job)
-        await self._archive.delete(job.stored)
-        job.tell()
+        await self._archive.remove_files(job.stored)
 
     async def whole(self, work: Coroutine[Any, Any, T]) -> T:
-        """Does some work to its end, even if whoever asked for it goes away."""
+        """Does some work to its end; who is cancelled meanwhile goes no sooner than that."""
         task = asyncio.create_task(work)
         self._finishing.add(task)
         task.add_done_callback(self._finishing.discard)
-        return await asyncio.shield(task)
+        cancelled: asyncio.CancelledError | None = None
+        while not task.done():
+            try:
+                await asyncio.wait({task})
+            except asyncio.CancelledError as error:
+                cancelled = error
+        result = task.result()
+        if cancelled is not None:
+            raise cancelled
+        return result
 
     def _pump(self) -> None:
         """Starts what may run, the oldest first."""
@@ -226,10 +253,8 @@ class EvaluationQueue:
 
     async def _change(self, job: Job, **changes: Any) -> None:
         """Changes an evaluation: in the store first, so that nobody sees what may be lost."""
-        if job.removed:
-            return
         stored = dataclasses.replace(job.stored, info=dataclasses.replace(job.info, **changes))
-        await self._archive.save(stored)
+        await self._archive.change(stored)
         job.stored = stored
         log.info("evaluation", id=job.info.id, state=job.state.value, error=job.info.error)
         job.tell()

@@ -18,6 +18,7 @@ from trajectron_model.data.eth_ucy import TEST_SETS, EthUcy
 from trajectron_model.evaluation.contenders import LEAVE_ONE_OUT, STRATIFIED, Z_BEST
 from trajectron_model.evaluation.plan import EvaluationPlan
 from trajectron_service.errors import ErrorKind, FieldViolation, ServiceError, invalid
+from trajectron_service.evaluations import entries
 from trajectron_service.evaluations.folders import MODEL_SUFFIXES, RECORDINGS
 from trajectron_service.evaluations.messages import EvaluationConfig, RecordingFile
 from trajectron_service.settings import Settings
@@ -124,9 +125,7 @@ class EvaluationChoices:
         return {base: self._served[base] for base in bases if base in self._served}
 
     def _entry(self, name: str) -> str:
-        """A served model lies beside the plan; a bundled one of its name would win over it."""
-        base = name.partition("@")[0]
-        return f"./{name}" if base in self._served and base in self._bundled else name
+        return entries.beside(name) if name.partition("@")[0] in self._served else name
 
     def _knows(self, name: str) -> bool:
         base, at, variant = name.partition("@")

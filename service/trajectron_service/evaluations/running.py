@@ -82,7 +82,7 @@ def _progress(values: dict[str, Any]) -> EvaluationProgress:
         share=values["share"],
         windows_done=values["windows_done"],
         windows_total=values["windows_total"],
-        model=values["entry"].removeprefix("./"),
+        model=values["entry"],
         set=values["set"],
         seconds_left=values["seconds_left"],
     )

@@ -121,8 +121,12 @@ class EvaluationStore:
         except (KeyError, TypeError, ValueError) as error:
             raise StoreError(f"{self._path}: a record is damaged: {error!r}") from error
 
-    async def save(self, stored: StoredEvaluation) -> None:
-        """Writes an evaluation, new or changed; on return it is on the disk."""
+    async def add(self, stored: StoredEvaluation) -> None:
+        """Writes a new evaluation; on return it is on the disk.
+
+        Raises:
+            sqlite3.IntegrityError: its number or its id is another's.
+        """
         row = (
             stored.number,
             stored.tenant,
@@ -132,10 +136,19 @@ class EvaluationStore:
             encode(stored.info),
         )
 
-        def write() -> None:
-            self._database.execute("REPLACE INTO evaluations VALUES (?, ?, ?, ?, ?, ?)", row)
+        def insert() -> None:
+            self._database.execute("INSERT INTO evaluations VALUES (?, ?, ?, ?, ?, ?)", row)
 
-        await self._on_thread(write)
+        await self._on_thread(insert)
+
+    async def change(self, stored: StoredEvaluation) -> None:
+        """Writes what an evaluation has become; nothing happens where it is not there."""
+        row = (encode(stored.info), stored.number)
+
+        def update() -> None:
+            self._database.execute("UPDATE evaluations SET record = ? WHERE number = ?", row)
+
+        await self._on_thread(update)
 
     async def delete(self, stored: StoredEvaluation) -> None:
         """Removes an evaluation; nothing happens where it is not there."""

@@ -16,9 +16,12 @@ from pathlib import Path
 from trajectron_model.checkpoint import CheckpointError, write_atomically
 from trajectron_model.data.errors import DataError
 from trajectron_model.evaluation.contenders import ContenderError, InSampleError
+from trajectron_model.evaluation.pictures import AllScores
 from trajectron_model.evaluation.plan import EvaluationPlan, PlanError
 from trajectron_model.evaluation.report import write_report
-from trajectron_model.evaluation.run import Progress, load_scores, run
+from trajectron_model.evaluation.results import Evaluation
+from trajectron_model.evaluation.run import RESULT, Progress, load_scores, run
+from trajectron_service.evaluations.entries import as_asked, asked
 from trajectron_service.evaluations.launch import say
 
 # Mistakes in what was asked for; anything else is a fault, with its traceback in the log.
@@ -37,7 +40,7 @@ class _Teller:
         now_s = time.monotonic()
         if now_s - self._told_s >= _SHORTEST_PAUSE_S or progress.share >= 1.0:
             self._told_s = now_s
-            say({"progress": progress._asdict()})
+            say({"progress": progress._replace(entry=asked(progress.entry))._asdict()})
 
 
 def main(folder: Path, data: Path | None) -> int:
@@ -56,9 +59,18 @@ def main(folder: Path, data: Path | None) -> int:
         except _REFUSALS as error:
             say({"refused": str(error)})
             return 1
-        write_atomically(folder / "result.csv", evaluation.to_csv().encode())
-        write_report(evaluation, load_scores(plan, folder, data=data), folder)
+        _write_results(evaluation, load_scores(plan, folder, data=data), folder)
     return 0
+
+
+def _write_results(evaluation: Evaluation, scores: AllScores, folder: Path) -> None:
+    """Every form of the result, by the names asked for; the JSON replaces the run's own."""
+    named = as_asked(evaluation)
+    scores = {(asked(entry), test_set): found for (entry, test_set), found in scores.items()}
+    content = json.dumps(named.to_json(), allow_nan=False) + "\n"
+    write_atomically(folder / RESULT, content.encode())
+    write_atomically(folder / "result.csv", named.to_csv().encode())
+    write_report(named, scores, folder)
 
 
 if __name__ == "__main__":
