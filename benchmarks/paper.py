@@ -8,8 +8,7 @@
 Every figure comes from the evaluation harness (`trajectron_model.evaluation.run`), the path of
 the command line and of the service. Work is kept in `--work` and goes on where it stopped; what
 is done already costs nothing, and processes that are told to do different things share it. The
-report goes to `--out`: `report.html`, `report.md`, figures,
-and the estimates as JSON.
+report goes to `--out`: `report.html`, `report.md`, figures, and the estimates as JSON.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ BASELINES = (
 )
 JITTERS_M = (0.02, 0.05, 0.10)
 SAMPLES = 2000  # as the paper drew
-FEW_WINDOWS = 250  # of each set, every k-th: of what is compared along itself, not with others
+FEW_WINDOWS = 250  # of each set, every k-th, for noise and few observations
 SCENES, REPEATS = 12, 5  # of each set, in the table of runtimes
 _QUICK_SCENES, _QUICK_REPEATS = 2, 1
 _MOST_SEEDS = 100
@@ -207,6 +206,9 @@ def measure(options: Options) -> Results:
         if name != "leaky" or plan.entries != (options.ours,)
     }
     evaluations = {name: carry_out(options, name, plan) for name, plan in wanted.items()}
+    if not options.files:
+        left_out = [name for name in BASELINES if name not in options.entries]
+        missing |= dict.fromkeys(left_out, "left out of this run by --models")
     models = {name: _model(options, name) for name in recordings}
     table_1 = wanted["table-1"]
     return Results(

@@ -13,7 +13,8 @@ from trajectron_model.evaluation.figures import Curve, Style
 from trajectron_model.evaluation.results import Evaluation
 
 _NOISE = (
-    "Gaussian noise on every observed coordinate of the protocol sgan; the truth stays clean. The "
+    "Gaussian noise on every observed coordinate of the protocol sgan, on every k-th window (the "
+    "facts above count them); the truth stays clean. The "
     "recordings are smooth splines, real trackers are not. A recording is jittered once: windows "
     "that overlap see the same noise."
 )

@@ -31,10 +31,10 @@ Exhibit = Table | Picture
 _BEST_OF = (100, 20, 5, 1)
 _ABOUT = (
     "The figures and tables of Ivanovic & Pavone, “The Trajectron” (ICCV 2019), for our models and "
-    "for every baseline, trained by us on the same leave-one-out splits, run through one harness "
-    "on the same windows with the same causal inputs. Small print gives 95% bootstrap intervals "
-    "over windows; the best of each column is marked. Published rows, in italics, are as their "
-    "authors report them and are not ranked."
+    "for the baselines beside them, trained by us on the same leave-one-out splits, run through "
+    "one harness on the same windows with the same causal inputs. Small print gives 95% bootstrap "
+    "intervals over windows; the best of each column is marked. Published rows, in italics, are "
+    "as their authors report them and are not ranked."
 )
 _REPRODUCTION = (
     "The paper's model and training, under the paper's conditions, to see whether they give its "
@@ -254,9 +254,9 @@ def few_observations(results: Results) -> Section:
     section = report.observations(results.evaluations["streaming"], results.style)
     about = (
         "Protocol streaming: each recording is streamed once from its first frame, as the service "
-        "does it; at every frame everyone in it is judged over the steps of their future that "
-        "exist. Agents are grouped by the steps at which they had been seen since they last "
-        "(re)appeared."
+        "does it; at every k-th frame (the facts above count them) everyone in it is judged over "
+        "the steps of their future that exist. Agents are grouped by the steps at which they had "
+        "been seen since they last (re)appeared."
     )
     return Section("Few observations, protocol streaming", (about,), section.contents)
 

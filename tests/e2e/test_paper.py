@@ -98,6 +98,10 @@ def test_a_quick_run_reports_everything_and_goes_on_where_it_stopped(
     monkeypatch.setattr(runtime, "measure_set", refused)
     paper.main(asked)
     assert (tmp_path / "out" / "report.html").read_bytes() == first
+    # Timings of other code do not stand in for this one's.
+    monkeypatch.setattr(runtime, "VERSION", -1)
+    with pytest.raises(AssertionError, match="done before"):
+        paper.main(asked)
 
 
 @pytest.mark.timeout(900)
@@ -107,6 +111,7 @@ def test_a_quick_run_on_the_benchmark_sets_published_rows_beside_ours(tmp_path: 
     text = (tmp_path / "out" / "report.md").read_text()
     assert "Trajectron Full, as published" in text
     assert "| *0.37* / *0.72* |" in text
+    assert "Missing: Social GAN, Social Attention" in text
     assert "Trajectron, z\\_best" in text and "Trajectron, stratified" in text
 
 

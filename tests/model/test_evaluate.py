@@ -120,7 +120,7 @@ def test_of_dependent_samples_there_is_a_best_of_all_alone(
     stand(model=Contender(Drifting(MISSES_M), independent=False))
     found = values(run.run(plan(square), tmp_path / "work"))
     assert found["min_fde_5"] == pytest.approx(0.5)
-    assert not {"min_fde_1", "joint_fde_1", "miss_1"} & found.keys()
+    assert not {"min_fde_1", "joint_fde_1", "miss_1", "energy"} & found.keys()
     fewer = values(run.run(plan(square, samples=1, kde_samples=5), tmp_path / "fewer"))
     assert not [name for name in fewer if name.startswith(("min_", "joint_", "miss_"))]
     assert fewer["fde_sample"] == pytest.approx(4.5)  # of the one that counts

@@ -440,6 +440,17 @@ async def test_an_id_is_taken_until_its_record_is_gone(
         await create(evaluations, "a")
 
 
+async def watched_while_it_runs(
+    evaluations: Evaluations, identity: str
+) -> AsyncIterator[EvaluationInfo]:
+    """Creates an evaluation; what is told of it from its running on."""
+    await create(evaluations, identity)
+    await until(evaluations, identity, EvaluationState.RUNNING)
+    watching = evaluations.watch(identity)
+    assert (await anext(watching)).state is EvaluationState.RUNNING
+    return watching
+
+
 async def test_what_cannot_be_deleted_stays_and_goes_on(
     settings: Settings, carried: Callable[[Run], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -451,10 +462,7 @@ async def test_what_cannot_be_deleted_stays_and_goes_on(
 
     carried(wait)
     async with opened(settings) as evaluations:
-        await create(evaluations, "a")
-        await until(evaluations, "a", EvaluationState.RUNNING)
-        watching = evaluations.watch("a")
-        assert (await anext(watching)).state is EvaluationState.RUNNING
+        watching = await watched_while_it_runs(evaluations, "a")
         with monkeypatch.context() as patch:
             patch.setattr(EvaluationStore, "delete", full_disk)
             with pytest.raises(sqlite3.OperationalError):
@@ -475,10 +483,7 @@ async def test_who_watches_is_told_though_files_cannot_be_deleted(
 
     carried(forever)
     async with opened(settings) as evaluations:
-        await create(evaluations, "a")
-        await until(evaluations, "a", EvaluationState.RUNNING)
-        watching = evaluations.watch("a")
-        assert (await anext(watching)).state is EvaluationState.RUNNING
+        watching = await watched_while_it_runs(evaluations, "a")
         with monkeypatch.context() as patch:
             patch.setattr(EvaluationFolder, "remove", refuse)
             with pytest.raises(PermissionError):

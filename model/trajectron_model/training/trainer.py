@@ -61,7 +61,9 @@ def train(
     device: str | None = None,
     resume: bool = False,
 ) -> Checkpoint:
-    """Trains a model and leaves the best one, by validation, in ``folder``, calibrated.
+    """Trains a model and leaves the best one, by validation, in ``folder``.
+
+    Its modes are calibrated then, unless the settings decline it.
 
     Args:
         config: of the model.
