@@ -206,9 +206,9 @@ def test_beyond_the_longest_horizon_the_last_change_is_held(
     longest = of_ann(network, state, MAX_HORIZON)
     assert ann.samples is not None
     assert ann.samples.shape == (5, MAX_HORIZON, 2)
-    np.testing.assert_allclose(ann.samples[:, :-2], longest[:, 2:], atol=1e-6)
+    np.testing.assert_allclose(ann.samples[:, :-2], longest[:, 2:], atol=1e-4)
     change = longest[:, -1] - longest[:, -2]
-    np.testing.assert_allclose(ann.samples[:, -1], longest[:, -1] + 2 * change, atol=1e-5)
+    np.testing.assert_allclose(ann.samples[:, -1], longest[:, -1] + 2 * change, atol=1e-4)
 
 
 def test_agents_that_cannot_move_are_forecast_only_when_asked_for() -> None:
