@@ -76,6 +76,7 @@ async def _serve(settings: Settings) -> None:
                 http_port=service.http_port,
                 grpc_port=service.grpc_port,
                 models=[model.name for model in service.application.list_models()],
+                kernels=next(model.kernels for model in service.application.list_models()),
             )
             await stop.wait()
             log.info("draining", grace_s=settings.drain_grace_s)
