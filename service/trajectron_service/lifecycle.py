@@ -81,6 +81,7 @@ async def _serve(settings: Settings) -> None:
                 store=service.store.kind,
                 durability=service.store.durability.value,
                 models=[model.name for model in service.application.list_models()],
+                kernels=next(model.kernels for model in service.application.list_models()),
             )
             await stop.wait()
             log.info("draining", grace_s=settings.drain_grace_s)
