@@ -90,35 +90,42 @@ static Block *block_in(void *workspace, const Decoder *decoder) {
     return block;
 }
 
-/* One LSTM step of `rows` rows from `hidden` to `next`; gates[row] is where its own begin. */
+/* The cells of LANES hidden units of one row: gates i, f, o and new as they leave the product. */
+INLINE void close_cell(const float *gates, float *cell, float *next) {
+    /* sigmoid(f) c + sigmoid(i) tanh(new), over a common denominator: divisions are slow */
+    vf i = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates), GATE_BOUND));
+    vf f = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates + LANES), GATE_BOUND));
+    vf o = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates + 2 * LANES), GATE_BOUND));
+    vf new = vf_exp_within(2.0f * vf_clamp(vf_load(gates + 3 * LANES), 10.0f));
+    vf below = i * (new + 1.0f);
+    vf c = (vf_load(cell) * below + (new - 1.0f) * f) / (f * below);
+    vf_store(cell, c);
+    vf e = vf_exp_within(2.0f * vf_clamp(c, 10.0f));
+    vf_store(next, (e - 1.0f) / (o * (e + 1.0f)));
+}
+
+/* One LSTM step of `rows` rows from `hidden` to `next`; gates[row] is where its own begin.
+ *
+ * Panel by panel: its product for all rows, then its cells. Closing the cells of each tile right
+ * behind its product is slower by half: their chains of dependent steps hold the product up.
+ */
 static void step_cells(const Decoder *decoder, long rows, const float *const *gates,
                        const float *hidden, float *next, float *cell, long stride) {
     const long depth = decoder->units + 2;
+    float made[BLOCK_ROWS * PANEL_COLUMNS] __attribute__((aligned(64)));
     for (long unit = 0; unit < decoder->units; unit += LANES) {
-        const float *panel = decoder->recurrent + unit * 4 * depth;
+        const float *panel = decoder->recurrent + unit * PANEL_VECTORS * depth;
         for (long first = 0; first < rows; first += TILE_ROWS) {
-            vf sums[TILE_ROWS * 4];
-#pragma GCC unroll 6
-            for (int row = 0; row < TILE_ROWS; row++)
-                for (int v = 0; v < 4; v++)
-                    sums[row * 4 + v] = vf_load(gates[first + row] + unit * 4 + v * LANES);
-            gemm_tile(TILE_ROWS, 4, panel, depth, hidden + first * stride, stride, sums);
-#pragma GCC unroll 6
-            for (int row = 0; row < TILE_ROWS; row++) {
-                const vf *sum = sums + row * 4;
-                float *old = cell + (first + row) * stride + unit;
-                /* sigmoid(f) c + sigmoid(i) tanh(new), over a common denominator */
-                vf i = 1.0f + vf_exp_within(-vf_clamp(sum[0], GATE_BOUND));
-                vf f = 1.0f + vf_exp_within(-vf_clamp(sum[1], GATE_BOUND));
-                vf o = 1.0f + vf_exp_within(-vf_clamp(sum[2], GATE_BOUND));
-                vf new = vf_exp_within(2.0f * vf_clamp(sum[3], 10.0f));
-                vf below = i * (new + 1.0f);
-                vf c = (vf_load(old) * below + (new - 1.0f) * f) / (f * below);
-                vf_store(old, c);
-                vf e = vf_exp_within(2.0f * vf_clamp(c, 10.0f));
-                vf_store(next + (first + row) * stride + unit, (e - 1.0f) / (o * (e + 1.0f)));
-            }
+            vf sums[TILE_ROWS * PANEL_VECTORS];
+            for (int i = 0; i < TILE_ROWS * PANEL_VECTORS; i++)
+                sums[i] = vf_load(gates[first + i / PANEL_VECTORS] + unit * PANEL_VECTORS +
+                                  i % PANEL_VECTORS * LANES);
+            gemm_tile(TILE_ROWS, PANEL_VECTORS, panel, depth, hidden + first * stride, stride, sums);
+            memcpy(made + first * PANEL_COLUMNS, sums, sizeof sums);
         }
+        for (long row = 0; row < rows; row++)
+            close_cell(made + row * PANEL_COLUMNS, cell + row * stride + unit,
+                       next + row * stride + unit);
     }
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -70,6 +70,16 @@ class _Packed:
     workspace_bytes: int
 
 
+class _Asked(NamedTuple):
+    """Rollouts, as ``Decoder.sample`` is told of them."""
+
+    prepared: Prepared
+    agent: Tensor  # [R]
+    latent: Tensor  # [R]
+    horizon: int
+    limit: float
+
+
 def sample(
     decoder: Decoder,
     prepared: Prepared,
@@ -89,7 +99,8 @@ def sample(
     out = torch.empty_like(normal)
     function = library.library.trajectron_decode_sample
     pointers = [_pointer(t) for t in (uniform, normal, out)]
-    _run(decoder, library, prepared, agent, latent, horizon, limit, function, pointers)
+    asked = _Asked(prepared, agent, latent, horizon, limit)
+    _run(decoder, library, asked, function, pointers)
     return out
 
 
@@ -104,27 +115,25 @@ def moments(
     covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
     function = library.library.trajectron_decode_moments
     pointers = [_pointer(means), _pointer(covariances)]
-    _run(decoder, library, prepared, agent, latent, horizon, limit, function, pointers)
+    asked = _Asked(prepared, agent, latent, horizon, limit)
+    _run(decoder, library, asked, function, pointers)
     return means, covariances
 
 
 def _run(
     decoder: Decoder,
     library: Kernels,
-    prepared: Prepared,
-    agent: Tensor,
-    latent: Tensor,
-    horizon: int,
-    limit: float,
+    asked: _Asked,
     function: Callable[..., None],
     arrays: list[ctypes.c_void_p],
 ) -> None:
-    """Calls the kernel on all rows [R] of agents and latent values, shared among threads.
+    """Calls the kernel on all rows, shared among threads.
 
     Raises:
         IndexError: an agent or a latent value out of range: the kernel would read beyond.
     """
-    agents, latents = agent.contiguous().numpy(), latent.contiguous().numpy()
+    prepared = asked.prepared
+    agents, latents = asked.agent.contiguous().numpy(), asked.latent.contiguous().numpy()
     values = decoder.gates_latent.num_embeddings
     if not agents.size:
         return
@@ -143,8 +152,8 @@ def _run(
         order.ctypes.data,
         agents.ctypes.data,
         latents.ctypes.data,
-        horizon,
-        limit,
+        asked.horizon,
+        asked.limit,
     )
 
     def work(first: int, last: int) -> None:

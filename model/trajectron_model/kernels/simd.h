@@ -47,7 +47,8 @@ INLINE vf vf_load(const float *from) {
 
 INLINE void vf_store(float *to, vf v) { memcpy(to, &v, sizeof v); }
 
-INLINE vf vf_all(float x) { return (vf){0} + x; }
+/* x - 0 is x, so that this is one instruction; 0 + x is not, for x = -0. */
+INLINE vf vf_all(float x) { return x - (vf){0}; }
 
 /* The smaller and the larger; NaN if x is NaN. */
 INLINE vf vf_min(vf bound, vf x) {
