@@ -32,6 +32,7 @@ from trajectron_service.messages import (
 from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
+from trajectron_service.session_errors import STREAM_ENDED
 from trajectron_service.sessions import Change, Sessions
 from trajectron_service.settings import Settings
 from trajectron_service.stores import SessionKey, SessionStore
@@ -261,8 +262,8 @@ class Application:
                 resumed,
                 options,
                 fold=lambda requests, deadline: self._fold(key, requests, deadline),
-                on_end=lambda: self._sessions.delete(key, "stream_ended"),
-                busy=self._work.taken,
+                on_end=lambda: self._sessions.delete(key, STREAM_ENDED),
+                busy=lambda: self._streaming(key),
                 limits=StreamLimits(
                     self._settings.stream_window,
                     self._settings.max_batch_points,
@@ -310,7 +311,13 @@ class Application:
             )
             return Change(after, packed), answers
 
-        return await self._sessions.change(key, observe)
+        return await self._sessions.change(key, observe, extends=True)
+
+    @contextmanager
+    def _streaming(self, key: SessionKey) -> Iterator[None]:
+        """A stream is work in hand, and holds its session open."""
+        with self._work.taken(), self._sessions.held(key):
+            yield
 
     def _blank(self, config: SessionConfig) -> SceneRecord:
         """A session before its first frame."""
@@ -356,6 +363,7 @@ class Application:
         while True:
             await asyncio.sleep(HOUSEKEEPING_S)
             try:
+                await self._sessions.renew()
                 await self._sessions.reap()
                 await self._sessions.park()
             except Exception:
