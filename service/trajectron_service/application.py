@@ -32,6 +32,7 @@ from trajectron_service.messages import (
 from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
+from trajectron_service.session_errors import STREAM_ENDED
 from trajectron_service.sessions import Change, Sessions
 from trajectron_service.settings import Settings
 from trajectron_service.stores import SessionKey, SessionStore
@@ -250,7 +251,7 @@ class Application:
         with self._work.taken():
             if options.forecast is not None:
                 self._choices.check_options(options.forecast)
-            session, resumed = await self._open(session_id, config)
+            session, resumed = await self._open(session_id, config, must_exist=options.must_exist)
             key = _key(session.id)
             before = self._streams.get(key)
             if before is not None:
@@ -261,8 +262,8 @@ class Application:
                 resumed,
                 options,
                 fold=lambda requests, deadline: self._fold(key, requests, deadline),
-                on_end=lambda: self._sessions.delete(key, "stream_ended"),
-                busy=self._work.taken,
+                on_end=lambda: self._sessions.delete(key, STREAM_ENDED),
+                busy=lambda: self._streaming(key),
                 limits=StreamLimits(
                     self._settings.stream_window,
                     self._settings.max_batch_points,
@@ -274,10 +275,12 @@ class Application:
             return stream
 
     async def _open(
-        self, session_id: str | None, config: SessionConfig
+        self, session_id: str | None, config: SessionConfig, *, must_exist: bool
     ) -> tuple[SessionInfo, bool]:
         """The session, and whether it was there already."""
         key = _key(chosen.session_id(session_id))
+        if must_exist:
+            return await self._sessions.info(key), True
         if session_id:
             with _past(ErrorKind.UNKNOWN_SESSION):
                 return await self._sessions.info(key), True
@@ -310,7 +313,13 @@ class Application:
             )
             return Change(after, packed), answers
 
-        return await self._sessions.change(key, observe)
+        return await self._sessions.change(key, observe, extends=True)
+
+    @contextmanager
+    def _streaming(self, key: SessionKey) -> Iterator[None]:
+        """A stream is work in hand, and holds its session open."""
+        with self._work.taken(), self._sessions.held(key):
+            yield
 
     def _blank(self, config: SessionConfig) -> SceneRecord:
         """A session before its first frame."""
@@ -356,6 +365,7 @@ class Application:
         while True:
             await asyncio.sleep(HOUSEKEEPING_S)
             try:
+                await self._sessions.renew()
                 await self._sessions.reap()
                 await self._sessions.park()
             except Exception:

@@ -135,6 +135,7 @@ def stream_options(message: pb.StreamOpen) -> core.StreamOptions:
         forecast=forecast_options(message.options) if every else None,
         delivery=_known(_DELIVERIES, message.delivery, "delivery", "a StreamDelivery"),
         close_session_at_end=message.close_session_at_end,
+        must_exist=message.must_exist,
     )
 
 
@@ -267,6 +268,7 @@ def model_message(model: core.ModelInfo) -> pb.Model:
         latent_values=model.latent_values,
         is_default=model.is_default,
         provenance_json=json.dumps(dict(model.provenance)),
+        kernels=model.kernels,
     )
 
 

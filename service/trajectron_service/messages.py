@@ -220,6 +220,7 @@ class StreamOptions:
     forecast: ForecastOptions | None
     delivery: Delivery = Delivery.ALL
     close_session_at_end: bool = False
+    must_exist: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +250,10 @@ class StreamReply:
 
 @dataclass(frozen=True, slots=True)
 class ModelInfo:
-    """A model that this server can run; ``provenance`` is its checkpoint's, as JSON values."""
+    """A model that this server can run; ``provenance`` is its checkpoint's, as JSON values.
+
+    ``kernels`` says what computes it: an instruction set's name, or torch and why.
+    """
 
     name: str
     hash: str
@@ -259,3 +263,4 @@ class ModelInfo:
     latent_values: int
     is_default: bool
     provenance: Mapping[str, object]
+    kernels: str = "torch"

@@ -15,6 +15,7 @@ Positions are metres in your own world-fixed frame, times seconds on your own cl
 """
 
 from trajectron_client.async_calls import AsyncSession
+from trajectron_client.async_streams import AsyncStream
 from trajectron_client.evaluations import (
     Evaluation,
     EvaluationOptions,
@@ -40,7 +41,10 @@ from trajectron_client.exceptions import (
     OverloadedError,
     ResourceExhaustedError,
     ServiceError,
+    SessionDamagedError,
     SessionExistsError,
+    SessionLostError,
+    StoreUnavailableError,
     TooLargeError,
     TooManyEvaluationsError,
     TooManySessionsError,
@@ -77,7 +81,7 @@ from trajectron_client.scene import (
     StreamFrame,
     UnknownTypes,
 )
-from trajectron_client.streams import AsyncStream, Stream
+from trajectron_client.streams import Stream
 from trajectron_client.sync_calls import Session
 
 __all__ = [
@@ -124,10 +128,13 @@ __all__ = [
     "SceneGraph",
     "ServiceError",
     "Session",
+    "SessionDamagedError",
     "SessionExistsError",
     "SessionInfo",
+    "SessionLostError",
     "SessionOptions",
     "SessionSnapshot",
+    "StoreUnavailableError",
     "Stream",
     "StreamFrame",
     "StreamReply",

@@ -1147,6 +1147,7 @@ class StreamOpen(_message.Message):
     FORECAST_EVERY_FRAME_FIELD_NUMBER: _builtins.int
     DELIVERY_FIELD_NUMBER: _builtins.int
     CLOSE_SESSION_AT_END_FIELD_NUMBER: _builtins.int
+    MUST_EXIST_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """An open session to go on with, or the id of a new one; assigned when empty."""
     forecast_every_frame: _builtins.bool
@@ -1154,6 +1155,10 @@ class StreamOpen(_message.Message):
     delivery: Global___StreamDelivery.ValueType
     close_session_at_end: _builtins.bool
     """Closes the session when the stream ends in good order; default false."""
+    must_exist: _builtins.bool
+    """The session has to exist: NOT_FOUND, with what became of it, instead of a new one.
+    Set by a client that goes on after a break.
+    """
     @_builtins.property
     def config(self) -> Global___SessionConfig:
         """For a new session; ignored when the session exists."""
@@ -1171,10 +1176,11 @@ class StreamOpen(_message.Message):
         forecast_every_frame: _builtins.bool | None = ...,
         delivery: Global___StreamDelivery.ValueType = ...,
         close_session_at_end: _builtins.bool = ...,
+        must_exist: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "config", b"config", "forecast_every_frame", b"forecast_every_frame", "options", b"options"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "close_session_at_end", b"close_session_at_end", "config", b"config", "delivery", b"delivery", "forecast_every_frame", b"forecast_every_frame", "options", b"options", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "close_session_at_end", b"close_session_at_end", "config", b"config", "delivery", b"delivery", "forecast_every_frame", b"forecast_every_frame", "must_exist", b"must_exist", "options", b"options", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__forecast_every_frame: _TypeAlias = _typing.Literal["forecast_every_frame"]  # noqa: Y015
     _WhichOneofArgType__forecast_every_frame: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame"]  # noqa: Y015
@@ -1360,6 +1366,7 @@ class Model(_message.Message):
     LATENT_VALUES_FIELD_NUMBER: _builtins.int
     IS_DEFAULT_FIELD_NUMBER: _builtins.int
     PROVENANCE_JSON_FIELD_NUMBER: _builtins.int
+    KERNELS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     hash: _builtins.str
     """sha256 of the weights, hexadecimal."""
@@ -1370,6 +1377,8 @@ class Model(_message.Message):
     """Whether requests that name no model get this one."""
     provenance_json: _builtins.str
     """JSON: task, data, split, seed, metrics, licence note."""
+    kernels: _builtins.str
+    """What computes it: the instruction set of the compiled kernels, or torch and why."""
     @_builtins.property
     def agent_types(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -1385,10 +1394,11 @@ class Model(_message.Message):
         latent_values: _builtins.int = ...,
         is_default: _builtins.bool = ...,
         provenance_json: _builtins.str = ...,
+        kernels: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["dt", b"dt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_types", b"agent_types", "dt", b"dt", "hash", b"hash", "horizon", b"horizon", "is_default", b"is_default", "latent_values", b"latent_values", "name", b"name", "provenance_json", b"provenance_json"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_types", b"agent_types", "dt", b"dt", "hash", b"hash", "horizon", b"horizon", "is_default", b"is_default", "kernels", b"kernels", "latent_values", b"latent_values", "name", b"name", "provenance_json", b"provenance_json"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
