@@ -31,6 +31,7 @@ from trajectron_model.encoders import EncoderState
 from trajectron_model.features import Kinematics, from_frame
 from trajectron_model.gmm import choose
 from trajectron_model.integration import integrate
+from trajectron_model.kernels.threads import torch_alone
 from trajectron_model.modes import (
     mode_moments,
     start_velocity,
@@ -135,6 +136,13 @@ def forecast_scenes(
     """The futures that each request asks of its state; see ``Trajectron.forecast``."""
     if not states:
         return []
+    with torch_alone():
+        return _forecast_scenes(model, states, requests)
+
+
+def _forecast_scenes(
+    model: Trajectron, states: Sequence[SceneState], requests: Sequence[ForecastRequest]
+) -> list[SceneForecast]:
     picked = [_rows(model, s, r) for s, r in zip(states, requests, strict=True)]
     results = [
         _blank(model, s, r, rows) for s, r, rows in zip(states, requests, picked, strict=True)
