@@ -38,6 +38,8 @@ from trajectron_service.stores import SessionKey, SessionStore
 from trajectron_service.stores.memory import MemoryStore
 from trajectron_service.streams import Stream, StreamLimits
 from trajectron_service.timebase import Timeline
+from trajectron_service.watching.accuracy import LiveAccuracy, WatchLimits
+from trajectron_service.watching.drawing import mixture_drawer
 from trajectron_service.work import WorkInHand
 
 __all__ = ["Application", "Stream"]
@@ -99,7 +101,9 @@ class Application:
             metrics=metrics,
             max_sessions=settings.max_sessions,
             park_after_s=settings.park_after_s,
+            on_close=self._on_close,
         )
+        self._accuracy = self._watch() if settings.live_accuracy else None
         self._streams: weakref.WeakValueDictionary[SessionKey, Stream] = (
             weakref.WeakValueDictionary()
         )
@@ -112,12 +116,26 @@ class Application:
         metrics.in_hand.set_function(lambda: self._work.count)
         metrics.ready.set_function(lambda: float(self.ready))
 
+    def _watch(self) -> LiveAccuracy:
+        settings = self._settings
+        return LiveAccuracy(
+            WatchLimits(settings.live_accuracy_budget, settings.live_accuracy_pending),
+            self._metrics.accuracy,
+            self._batcher.run_alone,
+            lambda model: self._engine.models[model].info.horizon,
+        )
+
     async def start(self) -> None:
         """Warms the models up and begins to close idle sessions; then ``ready`` is true."""
         if self._settings.warm_up:
             await self._batcher.run_alone(self._engine.warm_up)
         self._housekeeper = asyncio.create_task(self._keep_house(), name="housekeeper")
         self._started = True
+
+    @property
+    def metrics(self) -> Metrics:
+        """What it was told to tell everything."""
+        return self._metrics
 
     @property
     def ready(self) -> bool:
@@ -141,6 +159,8 @@ class Application:
             self._housekeeper.cancel()
             with suppress(asyncio.CancelledError):
                 await self._housekeeper
+        if self._accuracy is not None:
+            await self._accuracy.close()
         await self._batcher.close()
 
     def list_models(self) -> tuple[ModelInfo, ...]:
@@ -232,16 +252,21 @@ class Application:
         """The futures from the session's newest frame."""
         key = _key(session_id)
 
-        async def look(record: SceneRecord) -> tuple[Change, Forecast]:
+        async def look(record: SceneRecord) -> tuple[Change, tuple[SceneRecord, Forecast]]:
             after, forecast = await self._forecaster.forecast(
                 record, options, key=key, deadline=limit
             )
-            return Change(after), forecast
+            return Change(after), (after, forecast)
 
         with self._work.taken():
             self._choices.check_options(options)
             async with self._until(deadline) as limit:
-                return await self._sessions.change(key, look)
+                record, forecast = await self._sessions.change(key, look)
+        newest = record.timeline.newest
+        if self._accuracy is not None and newest is not None:
+            draw = mixture_drawer(self._engine, record)
+            self._accuracy.forecast(key, record.version, newest, forecast, draw)
+        return forecast
 
     async def open_stream(
         self, session_id: str | None, config: SessionConfig, options: StreamOptions
@@ -299,7 +324,9 @@ class Application:
     ) -> list[FrameAnswer]:
         """Folds frames into a session."""
 
-        async def observe(record: SceneRecord) -> tuple[Change, list[FrameAnswer]]:
+        async def observe(
+            record: SceneRecord,
+        ) -> tuple[Change, tuple[SceneRecord, list[FrameAnswer]]]:
             after, packed, answers = await self._forecaster.fold(
                 record,
                 requests,
@@ -308,9 +335,31 @@ class Application:
                 pack=self._sessions.durable,
                 strict=strict,
             )
-            return Change(after, packed), answers
+            return Change(after, packed), (after, answers)
 
-        return await self._sessions.change(key, observe)
+        record, answers = await self._sessions.change(key, observe)
+        self._note_answers(key, record, answers)
+        return answers
+
+    def _note_answers(
+        self, key: SessionKey, record: SceneRecord, answers: Sequence[FrameAnswer]
+    ) -> None:
+        """Tells of accepted frames and of forecasts from them; ``record`` is that after them."""
+        if self._accuracy is None:
+            return
+        for answer in answers:
+            if answer.seen is None:
+                continue
+            version = answer.result.version
+            self._accuracy.frame(key, version, answer.seen)
+            if answer.forecast is not None:
+                last = version == record.version
+                draw = mixture_drawer(self._engine, record) if last else None
+                self._accuracy.forecast(key, version, answer.seen, answer.forecast, draw)
+
+    def _on_close(self, key: SessionKey) -> None:
+        if self._accuracy is not None:
+            self._accuracy.closed(key)
 
     def _blank(self, config: SessionConfig) -> SceneRecord:
         """A session before its first frame."""
@@ -348,6 +397,9 @@ class Application:
 
     def _note_batch(self, report: BatchReport) -> None:
         self._metrics.batch_jobs.observe(report.entries)
+        self._metrics.inference_seconds.inc(report.ran_s)
+        if self._accuracy is not None:
+            self._accuracy.inferred(report.ran_s)
         for waited_s in report.waited_s:
             self._metrics.stage_seconds.labels("queue").observe(waited_s)
 

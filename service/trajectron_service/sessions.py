@@ -67,6 +67,7 @@ class Sessions:
         metrics: told about sessions, agents and edges.
         max_sessions: more are refused.
         park_after_s: unused for longer, a session is kept as bytes only.
+        on_close: told which session has been closed for good.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Sessions:
         metrics: Metrics,
         max_sessions: int,
         park_after_s: float,
+        on_close: Callable[[SessionKey], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._pack = pack
@@ -85,6 +87,7 @@ class Sessions:
         self._metrics = metrics
         self._max_sessions = max_sessions
         self._park_after_s = park_after_s
+        self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
         self._creating = asyncio.Lock()
 
@@ -308,6 +311,7 @@ class Sessions:
         if live is not None:
             self._close(live)
         self._metrics.evictions.labels(reason).inc()
+        self._on_close(key)
         await self._count()
         return True
 

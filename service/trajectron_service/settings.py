@@ -90,6 +90,20 @@ class Settings(BaseSettings):
     )
     drain_grace_s: Seconds = Field(20.0, description="Time for work in hand after SIGTERM.")
 
+    live_accuracy: bool = Field(
+        True, description="Score forecasts of sessions when their future arrives."
+    )
+    live_accuracy_budget: float = Field(
+        0.03,
+        gt=0.0,
+        le=1000.0,
+        description="Share of inference time that this may take; of forecasts beyond it none is "
+        "scored. Far more than 1: all are.",
+    )
+    live_accuracy_pending: Count = Field(
+        2048, description="Agents whose forecasts may wait for their future, about 12 kB each."
+    )
+
     data: Path | None = Field(
         None,
         description="Folder of the ETH/UCY recordings with their `splits.json`, or its parent; "
