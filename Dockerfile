@@ -15,13 +15,14 @@ print(*p["dependencies"], *p["optional-dependencies"]["service"], sep="\n")' > r
     && pip install --constraint constraints.txt ${TORCH_INDEX_URL:+--extra-index-url "$TORCH_INDEX_URL"} \
         --requirement requirements.txt
 
-COPY README.md LICENSE ./
+COPY README.md LICENSE hatch_build.py ./
 COPY model ./model
 COPY service ./service
 COPY clients ./clients
 COPY protos ./protos
 RUN python -m venv /opt/build \
     && /opt/build/bin/pip install --constraint constraints.txt hatchling \
+        $(/opt/build/bin/python model/trajectron_model/kernels/build.py --requirement) \
     && /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir dist . \
     && pip install --no-deps dist/*.whl
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from trajectron_model.config import ModelConfig
 from trajectron_model.gmm import BivariateMixture, choose, correlated
 from trajectron_model.integration import limit_speed
+from trajectron_model.kernels.dense import linear
 
 _CORRELATION_BOUND = 0.98
 # Rows decoded at a time without gradients: the gates of a block stay in the processor's cache,
@@ -74,7 +75,8 @@ class Decoder(nn.Module):
 
     def prepare(self, encoding: Tensor, velocity: Tensor) -> Prepared:
         """What rollouts of N agents share, from h_enc [N, D] and last velocities [N, 2]."""
-        return Prepared(self.gates_encoding(encoding), self.start_encoding(encoding), velocity)
+        gates = linear(self.gates_encoding, encoding)
+        return Prepared(gates, linear(self.start_encoding, encoding), velocity)
 
     def start(self, prepared: Prepared, agent: Tensor, latent: Tensor) -> Start:
         """The beginning of R rollouts: of agent [R] (a row of ``prepared``) under z [R].

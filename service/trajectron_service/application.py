@@ -32,6 +32,7 @@ from trajectron_service.messages import (
 from trajectron_service.metrics import Metrics
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
+from trajectron_service.session_errors import STREAM_ENDED
 from trajectron_service.sessions import Change, Sessions
 from trajectron_service.settings import Settings
 from trajectron_service.stores import SessionKey, SessionStore
@@ -286,8 +287,8 @@ class Application:
                 resumed,
                 options,
                 fold=lambda requests, deadline: self._fold(key, requests, deadline),
-                on_end=lambda: self._sessions.delete(key, "stream_ended"),
-                busy=self._work.taken,
+                on_end=lambda: self._sessions.delete(key, STREAM_ENDED),
+                busy=lambda: self._streaming(key),
                 limits=StreamLimits(
                     self._settings.stream_window,
                     self._settings.max_batch_points,
@@ -337,7 +338,7 @@ class Application:
             )
             return Change(after, packed), (after, answers)
 
-        record, answers = await self._sessions.change(key, observe)
+        record, answers = await self._sessions.change(key, observe, extends=True)
         self._note_answers(key, record, answers)
         return answers
 
@@ -360,6 +361,12 @@ class Application:
     def _on_close(self, key: SessionKey) -> None:
         if self._accuracy is not None:
             self._accuracy.closed(key)
+
+    @contextmanager
+    def _streaming(self, key: SessionKey) -> Iterator[None]:
+        """A stream is work in hand, and holds its session open."""
+        with self._work.taken(), self._sessions.held(key):
+            yield
 
     def _blank(self, config: SessionConfig) -> SceneRecord:
         """A session before its first frame."""
@@ -408,6 +415,7 @@ class Application:
         while True:
             await asyncio.sleep(HOUSEKEEPING_S)
             try:
+                await self._sessions.renew()
                 await self._sessions.reap()
                 await self._sessions.park()
             except Exception:

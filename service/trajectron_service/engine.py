@@ -15,7 +15,7 @@ from typing import Protocol, cast
 import numpy as np
 import torch
 
-from trajectron_model import registry
+from trajectron_model import kernels, registry
 from trajectron_model.state import SceneFrame, SceneState
 from trajectron_model.trajectron import Trajectron
 from trajectron_service.draws import forecast_all
@@ -209,6 +209,7 @@ def _facts(loaded: LoadedModel, is_default: bool) -> ModelFacts:
         latent_values=config.latent_values,
         is_default=is_default,
         provenance=loaded.provenance,
+        kernels=kernels.in_use(),
     )
     return ModelFacts(info, {name: config.speed_limit_mps(name) for name in config.node_types})
 

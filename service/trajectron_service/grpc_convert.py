@@ -267,6 +267,7 @@ def model_message(model: core.ModelInfo) -> pb.Model:
         latent_values=model.latent_values,
         is_default=model.is_default,
         provenance_json=json.dumps(dict(model.provenance)),
+        kernels=model.kernels,
     )
 
 

@@ -167,6 +167,9 @@ class Model(Answer):
     latent_values: int = Field(description="Z, the number of modes.")
     is_default: bool = Field(description="Whether requests that name no model get this one.")
     provenance: dict[str, Any] = Field(description="Task, data, split, seed, metrics, licence.")
+    kernels: str = Field(
+        description="What computes it: the instruction set of the kernels, or torch and why."
+    )
 
 
 class Models(Answer):

@@ -135,6 +135,7 @@ def model_json(model: ModelInfo) -> dict[str, Any]:
         "latent_values": model.latent_values,
         "is_default": model.is_default,
         "provenance": dict(model.provenance),
+        "kernels": model.kernels,
     }
 
 

@@ -25,6 +25,8 @@ from trajectron_service.http_routes import http_app
 from trajectron_service.http_server import HttpServer, listen
 from trajectron_service.metrics import Metrics
 from trajectron_service.settings import Settings, SettingsError
+from trajectron_service.stores import SessionStore
+from trajectron_service.stores.opening import open_store
 from trajectron_service.work import WorkInHand
 
 DISTRIBUTION = "trajectron-service"
@@ -47,6 +49,7 @@ class Service:
     evaluations: Evaluations
     health: Health
     metrics: Metrics
+    store: SessionStore
     http_port: int
     grpc_port: int
 
@@ -75,7 +78,10 @@ async def _serve(settings: Settings) -> None:
                 host=settings.host,
                 http_port=service.http_port,
                 grpc_port=service.grpc_port,
+                store=service.store.kind,
+                durability=service.store.durability.value,
                 models=[model.name for model in service.application.list_models()],
+                kernels=next(model.kernels for model in service.application.list_models()),
             )
             await stop.wait()
             log.info("draining", grace_s=settings.drain_grace_s)
@@ -101,7 +107,9 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
             settings, lambda stage, seconds: metrics.stage_seconds.labels(stage).observe(seconds)
         )
         work = WorkInHand(metrics)
-        application = Application(settings, loaded, metrics, work=work)
+        store = await open_store(settings, metrics)
+        stack.push_async_callback(store.close)
+        application = Application(settings, loaded, metrics, work=work, store=store)
         stack.push_async_callback(_close, application)
         evaluations = Evaluations(settings, metrics, work)
         stack.push_async_callback(evaluations.close)
@@ -130,7 +138,7 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         await evaluations.start()
         await health.ready()
         http_port = listener.getsockname()[1]
-        yield Service(application, evaluations, health, metrics, http_port, grpc_port)
+        yield Service(application, evaluations, health, metrics, store, http_port, grpc_port)
 
 
 async def _drain(

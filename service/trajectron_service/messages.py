@@ -249,7 +249,10 @@ class StreamReply:
 
 @dataclass(frozen=True, slots=True)
 class ModelInfo:
-    """A model that this server can run; ``provenance`` is its checkpoint's, as JSON values."""
+    """A model that this server can run; ``provenance`` is its checkpoint's, as JSON values.
+
+    ``kernels`` says what computes it: an instruction set's name, or torch and why.
+    """
 
     name: str
     hash: str
@@ -259,3 +262,4 @@ class ModelInfo:
     latent_values: int
     is_default: bool
     provenance: Mapping[str, object]
+    kernels: str = "torch"

@@ -176,7 +176,7 @@ class Metrics:
         )
         self.evictions = Counter(
             "trajectron_sessions_closed",
-            "Sessions closed by reason (deleted, idle, stream_ended).",
+            "Sessions closed by reason (deleted, idle, stream_ended, damaged, lost).",
             ("reason",),
             registry=registry,
         )
@@ -197,6 +197,39 @@ class Metrics:
             registry=registry,
         )
         self.accuracy = AccuracyMetrics(registry)
+        self.conflicts = Counter(
+            "trajectron_session_conflicts",
+            "Changes of sessions done again because another replica was faster.",
+            registry=registry,
+        )
+        self.quarantined = Gauge(
+            "trajectron_sessions_quarantined",
+            "Unreadable sessions that the store keeps aside.",
+            registry=registry,
+        )
+        self.store_info = Gauge(
+            "trajectron_store_info",
+            "Where sessions are kept, and what an acknowledged frame survives.",
+            ("kind", "durability"),
+            registry=registry,
+        )
+        self.store_up = Gauge(
+            "trajectron_store_up",
+            "1 while the store answers: how its last operation went.",
+            registry=registry,
+        )
+        self.store_errors = Counter(
+            "trajectron_store_errors",
+            "Operations of the store that failed or took too long.",
+            ("operation",),
+            registry=registry,
+        )
+        self.store_group = Histogram(
+            "trajectron_store_commit_operations",
+            "Operations of sessions that shared one commit of the store.",
+            buckets=SIZES,
+            registry=registry,
+        )
         self.superseded = Counter(
             "trajectron_forecasts_superseded",
             "Forecasts of streams left out because a newer frame had come.",

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import struct
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from trajectron_service.messages import SessionConfig, SessionInfo, UnknownTypes
 from trajectron_service.scenes import States, no_states
 from trajectron_service.timebase import Committed, Grid, Observation, Seen, Timeline
 
-_MAGIC = b"TJS1"
-_LENGTH = struct.Struct("<Q")
+# magic, version, checksum of the rest; length of the head, head, packed states.
+_MAGIC = b"TJS"
+_VERSION = b"\x02"
+_CHECKSUM_BYTES = 8
+_LENGTH = struct.Struct("<I")
+# Higher levels gain little on names and cost more than the rest of the write.
+_LEVEL = 1
 
 
 class RecordError(ValueError):
-    """Bytes that are no session, or one of a format that this server does not know."""
+    """Bytes that are no session, or not as they were written."""
+
+
+class UnknownFormatError(RecordError):
+    """A session in a format that this version of the service does not know."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,77 +92,131 @@ class SceneRecord:
 
 
 def encode(record: SceneRecord, packed: bytes) -> bytes:
-    """The record with its states as the engine packed them."""
+    """The record with its states as the engine packed them.
+
+    Every id and type is written once and named by its place after that; the newest frame's
+    agents stand where they were last seen, so only their places are written again.
+    """
     timeline = record.timeline
+    ids = _Names()
+    types = _Names()
+    seen = [(ids.place(agent), types.place(last.type)) for agent, last in timeline.seen.items()]
     newest = timeline.newest
     head = {
-        "config": {**dataclasses.asdict(record.config)},
+        "config": dataclasses.asdict(record.config),
         "model_hash": record.model_hash,
         "created_at": record.created_at,
         "version": record.version,
         "last_sequence": record.last_sequence,
         "edge_count": record.edge_count,
         "grid": dataclasses.astuple(timeline.grid),
-        "newest": newest and [newest.time_s, newest.ids, newest.types, newest.positions.tolist()],
-        "seen": {agent: tuple(last) for agent, last in timeline.seen.items()},
+        "newest": newest and (newest.time_s, [ids.place(agent) for agent in newest.ids]),
+        "seen_types": [place for _, place in seen],
         "departed": timeline.departed,
         "committed": [
-            (state.serial, state.time_s, sorted(state.ids), sorted(state.pending))
+            (state.serial, state.time_s, ids.places(state.ids), ids.places(state.pending))
             for state in timeline.committed
         ],
         "next_serial": timeline.next_serial,
+        "ids": ids.names,
+        "types": types.names,
     }
     text = orjson.dumps(head)
-    return b"".join((_MAGIC, _LENGTH.pack(len(text)), text, packed))
+    places = np.array([(s.time_s, s.x, s.y) for s in timeline.seen.values()], dtype="<f8")
+    told = zlib.compress(b"".join((_LENGTH.pack(len(text)), text, places.tobytes())), _LEVEL)
+    body = b"".join((_LENGTH.pack(len(told)), told, packed))
+    return b"".join((_MAGIC, _VERSION, _checksum(body), body))
 
 
 def decode(data: bytes) -> SceneRecord:
     """The inverse of ``encode``; the states stay bytes until the engine needs them.
 
     Raises:
-        RecordError: these bytes are no record.
+        UnknownFormatError: it is a record of another version of the format.
+        RecordError: these bytes are no record, or not as they were written.
     """
-    start = len(_MAGIC) + _LENGTH.size
-    if data[: len(_MAGIC)] != _MAGIC or len(data) < start:
-        raise RecordError("these bytes are no session of this format")
-    end = start + _LENGTH.unpack_from(data, len(_MAGIC))[0]
+    if not data.startswith(_MAGIC):
+        raise RecordError("these bytes are no session")
+    version = data[len(_MAGIC) : len(_MAGIC) + 1]
+    if version and version != _VERSION:
+        raise UnknownFormatError(f"its format has version {version[0]}, not {_VERSION[0]}")
+    start = len(_MAGIC) + 1 + _CHECKSUM_BYTES
+    body = data[start:]
+    if len(body) < _LENGTH.size or data[start - _CHECKSUM_BYTES : start] != _checksum(body):
+        raise RecordError("its checksum does not fit")
+    end = _LENGTH.size + _LENGTH.unpack_from(body)[0]
     try:
-        head = orjson.loads(data[start:end])
+        told = zlib.decompress(body[_LENGTH.size : end])
+        split = _LENGTH.size + _LENGTH.unpack_from(told)[0]
+        head = orjson.loads(told[_LENGTH.size : split])
+        places = np.frombuffer(told[split:], dtype="<f8").reshape(-1, 3)  # [A, 3] time, x, y
         return SceneRecord(
             config=_config(head["config"]),
             model_hash=head["model_hash"],
             created_at=head["created_at"],
-            timeline=_timeline(head),
+            timeline=_timeline(head, places),
             version=head["version"],
             last_sequence=head["last_sequence"],
-            states=data[end:] or no_states(),
+            states=body[end:] or no_states(),
             edge_count=head["edge_count"],
         )
-    except (orjson.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise RecordError(f"this session's record is damaged: {error}") from error
+    except (zlib.error, struct.error, LookupError, TypeError, ValueError) as error:
+        raise RecordError(f"it is damaged: {error}") from error
+
+
+class _Names:
+    """Names in the order in which they were first met; each is written once."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._places: dict[str, int] = {}
+
+    def place(self, name: str) -> int:
+        """Where the name stands, now if not before."""
+        place = self._places.setdefault(name, len(self.names))
+        if place == len(self.names):
+            self.names.append(name)
+        return place
+
+    def places(self, names: frozenset[str]) -> list[int]:
+        """Where these stand, rising."""
+        return sorted(self.place(name) for name in sorted(names))
+
+
+def _checksum(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=_CHECKSUM_BYTES).digest()
 
 
 def _config(fields: dict[str, Any]) -> SessionConfig:
     return SessionConfig(**{**fields, "unknown_types": UnknownTypes(fields["unknown_types"])})
 
 
-def _timeline(head: dict[str, Any]) -> Timeline:
-    newest = head["newest"]
+def _timeline(head: dict[str, Any], places: NDArray[np.float64]) -> Timeline:
+    ids, types, newest = head["ids"], head["types"], head["newest"]
+    rows = zip(head["seen_types"], places.tolist(), strict=True)
+    seen = [Seen(time_s, types[kind], x, y) for kind, (time_s, x, y) in rows]
+
+    def named(numbers: list[int]) -> frozenset[str]:
+        return frozenset(ids[number] for number in numbers)
+
     return Timeline(
         grid=Grid(*head["grid"]),
-        newest=newest and _observation(*newest),
-        seen={agent: Seen(*last) for agent, last in head["seen"].items()},
+        newest=newest and _observation(newest[0], newest[1], ids, seen),
+        # The agents seen were named first.
+        seen=dict(zip(ids, seen, strict=False)),
         departed=tuple(head["departed"]),
         committed=tuple(
-            Committed(serial, time_s, frozenset(ids), frozenset(pending))
-            for serial, time_s, ids, pending in head["committed"]
+            Committed(serial, time_s, named(held), named(pending))
+            for serial, time_s, held, pending in head["committed"]
         ),
         next_serial=head["next_serial"],
     )
 
 
 def _observation(
-    time_s: float, ids: list[str], types: list[str], positions: list[list[float]]
+    time_s: float, numbers: list[int], ids: list[str], seen: list[Seen]
 ) -> Observation:
-    places = np.array(positions, dtype=np.float64).reshape(-1, 2)
-    return Observation(time_s, tuple(ids), tuple(types), places)
+    agents = [seen[number] for number in numbers]
+    places = np.array([(one.x, one.y) for one in agents], dtype=np.float64).reshape(-1, 2)
+    names = tuple(ids[number] for number in numbers)
+    return Observation(time_s, names, tuple(one.type for one in agents), places)

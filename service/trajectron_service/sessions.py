@@ -7,34 +7,58 @@ frame is acknowledged; and when a session has been unused for a while and is *pa
 parked session becomes live again on its next use.
 
 **Order.** Requests of one session run one after the other, in the order they came. A record
-is replaced only after all its work succeeded, by compare-and-set on the version; the loser of
-a race between replicas reads the winner's record and does its work again on that.
+is replaced only after all its work succeeded, by compare-and-set on the stored revision; the loser
+of a race between replicas reads the winner's record and does its work again on that.
 
 **Races.** Removal from the store is atomic and has one winner, who alone counts it. A live
 session that has been removed is *closed*: work in flight on it comes to nothing, and a new
 session under its name is another object that shares nothing with it.
+
+**Expiry.** A durable store is told of a session's use with its frames, and otherwise only now and
+then: what it has may be late by a twentieth of the idle timeout (``_slack_s``), never early. A
+stream holds its session open, however long it is silent.
+
+**Faults of the store.** What changes a session fails, and nothing has changed in memory; what
+only looks at a session in memory goes on.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import weakref
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
-from trajectron_service import records
+from trajectron_service import logs, records
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.messages import SessionInfo
 from trajectron_service.metrics import Metrics
-from trajectron_service.records import SceneRecord
-from trajectron_service.stores import SessionKey, SessionStore, StoredSession
+from trajectron_service.records import RecordError, SceneRecord, UnknownFormatError
+from trajectron_service.session_errors import DAMAGED, DELETED, IDLE, LOST, gone, store_faults
+from trajectron_service.stores import (
+    Closure,
+    Creation,
+    Quota,
+    SessionKey,
+    SessionStore,
+    StoredSession,
+    StoreError,
+    new_revision,
+)
 from trajectron_service.validation import quoted
+
+log = logs.get(__name__)
 
 ResultT = TypeVar("ResultT")
 
 _WRITE_ATTEMPTS = 5
 _REAP_AT_ONCE = 1000
 _RETRY_AFTER_FULL_S = 5.0
+_LONGEST_SLACK_S = 30.0
+# A session that a stream holds is kept open for at least so long at a time.
+_HELD_S = 5.0
 
 
 class Change(NamedTuple):
@@ -46,13 +70,18 @@ class Change(NamedTuple):
 
 @dataclass(eq=False)
 class _Live:
-    """A session in use. ``record`` is None until it is read from the store."""
+    """A session in use. ``record`` is None until it is read from the store.
+
+    ``revision`` is the store's, as far as known here; ``stored_expiry`` is when it closes there.
+    """
 
     key: SessionKey
     expires_at: float
     record: SceneRecord | None = None
-    stored_version: int = 0
+    revision: str = ""
+    stored_expiry: float = 0.0
     users: int = 0
+    holds: int = 0
     closed: bool = False
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -85,11 +114,13 @@ class Sessions:
         self._pack = pack
         self._clock = clock
         self._metrics = metrics
-        self._max_sessions = max_sessions
+        self._quota = Quota(max_sessions)
         self._park_after_s = park_after_s
         self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
-        self._creating = asyncio.Lock()
+        self._locks: weakref.WeakValueDictionary[SessionKey, asyncio.Lock] = (
+            weakref.WeakValueDictionary()
+        )
 
     @property
     def durable(self) -> bool:
@@ -102,49 +133,62 @@ class Sessions:
         Raises:
             ServiceError: SESSION_EXISTS, TOO_MANY_SESSIONS.
         """
-        async with self._creating:
-            now = self._clock()
-            if await self._store.count() >= self._max_sessions:
+        now = self._clock()
+        expires_at = now + record.idle_timeout_s
+        stored = self._stored(record, b"", expires_at)
+        with store_faults():
+            made = await self._create(_Live(key, expires_at, record), stored)
+            if made in (Creation.FULL, Creation.TENANT_FULL):
                 await self.reap()
-                if await self._store.count() >= self._max_sessions:
-                    raise ServiceError(
-                        ErrorKind.TOO_MANY_SESSIONS,
-                        f"{self._max_sessions} sessions are open, as many as this server takes; "
-                        "close one or try again later",
-                        retry_after_s=_RETRY_AFTER_FULL_S,
-                    )
-            expires_at = now + record.idle_timeout_s
-            stored = StoredSession(record.version, expires_at, records.encode(record, b""))
-            if not await self._store.create(key, stored):
-                await self._evict(key, "idle", expired_by=now)
-                if not await self._store.create(key, stored):
-                    raise ServiceError(
-                        ErrorKind.SESSION_EXISTS, f"session_id: {quoted(key.id)} is open already"
-                    )
-            self._replace_live(_Live(key, expires_at, record, record.version))
+                made = await self._create(_Live(key, expires_at, record), stored)
+            if made is Creation.TAKEN:
+                raise ServiceError(
+                    ErrorKind.SESSION_EXISTS, f"session_id: {quoted(key.id)} is open already"
+                )
+            if made is not Creation.CREATED:
+                raise ServiceError(
+                    ErrorKind.TOO_MANY_SESSIONS,
+                    f"{self._quota.total} sessions are open, as many as this server takes; "
+                    "close one or try again later",
+                    retry_after_s=_RETRY_AFTER_FULL_S,
+                )
             await self._count()
         return record.info(key.id, expires_at)
 
     async def change(
-        self, key: SessionKey, work: Callable[[SceneRecord], Awaitable[tuple[Change, ResultT]]]
+        self,
+        key: SessionKey,
+        work: Callable[[SceneRecord], Awaitable[tuple[Change, ResultT]]],
+        *,
+        extends: bool = False,
     ) -> ResultT:
         """Runs ``work`` on the session's record, alone, and puts the record it gives in place.
 
         ``work`` may run again on a newer record when another replica was faster. When it
         raises, nothing has changed. Using a session keeps it open.
 
+        Args:
+            key: the session.
+            work: see above.
+            extends: the work adds frames: what it starts from is checked when it is stored, so
+                it need not be checked before.
+
         Raises:
-            ServiceError: UNKNOWN_SESSION, also when it is closed meanwhile.
+            ServiceError: UNKNOWN_SESSION, also when it is closed meanwhile; SESSION_DAMAGED,
+                STORE_UNAVAILABLE.
             Exception: whatever ``work`` raises.
         """
         live = self._enter(key)
         try:
             async with live.lock:
                 for _ in range(_WRITE_ATTEMPTS):
-                    record = await self._read(live)
+                    with store_faults():
+                        record = await self._read(live, fresh=not extends)
                     change, result = await work(record)
-                    if await self._put(live, record, change):
-                        return result
+                    with store_faults():
+                        if await self._put(live, record, change):
+                            return result
+                    self._metrics.conflicts.inc()
             raise ServiceError(
                 ErrorKind.OVERLOADED,
                 "other replicas keep changing this session; send its frames to one of them",
@@ -160,40 +204,77 @@ class Sessions:
             ServiceError: UNKNOWN_SESSION.
         """
         live = self._live.get(key)
-        stored = await self._store.read(key)
-        if stored is None or (stored.expires_at <= self._clock() and not (live and live.users)):
-            raise unknown_session(key)
-        if live is not None and live.record is not None and not live.closed:
-            return live.record.info(key.id, live.expires_at)
-        return records.decode(stored.data).info(key.id, stored.expires_at)
+        known = live is not None and live.record is not None and not live.closed
+        try:
+            stored = await self._store.read(key)
+        except StoreError:
+            if not known:
+                with store_faults():
+                    raise
+        else:
+            in_use = live is not None and (live.users or live.holds)
+            if stored is None or (stored.expires_at <= self._clock() and not in_use):
+                raise await self._gone(key)
+            if not known or (live and live.revision != stored.revision and not live.users):
+                record = await self._decoded(key, stored)
+                return record.info(key.id, stored.expires_at)
+        assert live is not None  # known
+        assert live.record is not None
+        return live.record.info(key.id, live.expires_at)
 
     async def page(
         self, tenant: str, after: str, limit: int
     ) -> tuple[tuple[SessionInfo, ...], bool]:
         """Up to ``limit`` sessions with ids greater than ``after``, rising; whether more follow."""
-        ids = await self._store.page(tenant, after, limit + 1)
+        with store_faults():
+            ids = await self._store.page(tenant, after, limit + 1)
         infos = []
         for session_id in ids[:limit]:
             try:
                 infos.append(await self.info(SessionKey(tenant, session_id)))
             except ServiceError as error:
-                # Gone since the page was read.
-                if error.kind is not ErrorKind.UNKNOWN_SESSION:
+                # Gone since the page was read, or found to be unreadable by that.
+                if error.kind not in (ErrorKind.UNKNOWN_SESSION, ErrorKind.SESSION_DAMAGED):
                     raise
         return tuple(infos), len(ids) > limit
 
-    async def delete(self, key: SessionKey, reason: str = "deleted") -> None:
+    async def delete(self, key: SessionKey, reason: str = DELETED) -> None:
         """Closes a session; work in flight on it comes to nothing.
 
         Raises:
             ServiceError: UNKNOWN_SESSION, also for the later of two deletions.
         """
         live = self._live.get(key)
-        busy = live is not None and live.users > 0
-        if not busy and await self._evict(key, "idle", expired_by=self._clock()):
-            raise unknown_session(key)
-        if not await self._evict(key, reason):
-            raise unknown_session(key)
+        busy = live is not None and (live.users > 0 or live.holds > 0)
+        with store_faults():
+            if not busy and await self._evict(key, self._idle(), expired_by=self._clock()):
+                raise await self._gone(key)
+            if not await self._evict(key, self._closure(reason)):
+                raise await self._gone(key)
+
+    @contextmanager
+    def held(self, key: SessionKey) -> Iterator[None]:
+        """Holds the session open, used or not, for the length of the block."""
+        live = self._live.get(key)
+        if live is None:
+            live = self._live[key] = _Live(key, expires_at=0.0)
+        live.holds += 1
+        try:
+            yield
+        finally:
+            live.holds -= 1
+            self._let_go(live)
+
+    async def renew(self) -> None:
+        """Keeps the sessions open that are held."""
+        now = self._clock()
+        for live in [live for live in self._live.values() if live.holds]:
+            idle_s = live.record.idle_timeout_s if live.record else 0.0
+            # Read first where it is parked; a busy one is kept open by what it does.
+            if live.users or (live.record and live.stored_expiry > now + max(idle_s / 2, _HELD_S)):
+                continue
+            with suppress(ServiceError):  # gone: whoever holds it is told when it is used
+                await self.change(live.key, _looked_at)
 
     async def reap(self) -> int:
         """Closes the sessions that have expired; how many. One in use is left alone."""
@@ -201,8 +282,9 @@ class Sessions:
         closed = 0
         for key in await self._store.expired(now, _REAP_AT_ONCE):
             live = self._live.get(key)
-            if live is None or not live.users:
-                closed += await self._evict(key, "idle", expired_by=now)
+            if live is None or not (live.users or live.holds):
+                idle_s = live.record.idle_timeout_s if live and live.record else None
+                closed += await self._evict(key, self._idle(idle_s), expired_by=now)
         return closed
 
     async def park(self) -> int:
@@ -220,6 +302,26 @@ class Sessions:
             parked += await self._park(live)
         return parked
 
+    async def _create(self, live: _Live, stored: StoredSession) -> Creation:
+        """Adds a session to the store, and makes it the live one where that went well."""
+        async with self._lock(live.key):
+            made = await self._store.create(live.key, stored, self._quota)
+            if made is Creation.TAKEN:
+                idle = self._idle()
+                if await self._remove(live.key, idle, expired_by=idle.at):
+                    made = await self._store.create(live.key, stored, self._quota)
+            if made is Creation.CREATED:
+                live.revision, live.stored_expiry = stored.revision, stored.expires_at
+                old = self._live.get(live.key)
+                if old is not None:
+                    self._close(old)
+                self._live[live.key] = live
+        return made
+
+    def _lock(self, key: SessionKey) -> asyncio.Lock:
+        """Held while a session of this key comes to be or ceases, here and in the store."""
+        return self._locks.setdefault(key, asyncio.Lock())
+
     def _enter(self, key: SessionKey) -> _Live:
         live = self._live.get(key)
         if live is None:
@@ -229,36 +331,71 @@ class Sessions:
 
     def _leave(self, live: _Live) -> None:
         live.users -= 1
-        if live.record is None and not live.users and self._live.get(live.key) is live:
+        self._let_go(live)
+
+    def _let_go(self, live: _Live) -> None:
+        unused = live.record is None and not live.users and not live.holds
+        if unused and self._live.get(live.key) is live:
             del self._live[live.key]
 
-    async def _read(self, live: _Live) -> SceneRecord:
-        """The session's record; from the store where it is not live, or may have expired."""
+    async def _read(self, live: _Live, *, fresh: bool) -> SceneRecord:
+        """The session's record; from the store where it is not live, may have expired or changed.
+
+        With ``fresh`` a store that other replicas use is asked whether the record is the newest.
+        """
         if live.closed:
-            raise unknown_session(live.key)
+            raise await self._gone(live.key)
         now = self._clock()
         # Whoever came before expiry holds the session open for those in line behind.
-        expired = live.users == 1 and live.expires_at <= now
-        if live.record is None or expired:
+        expired = live.users == 1 and not live.holds and live.expires_at <= now
+        if live.record is not None and not expired and not (fresh and self._store.shared):
+            return live.record
+        try:
             stored = await self._store.read(live.key)
-            if stored is None or live.closed:
-                self._close(live)
-                raise unknown_session(live.key)
-            if expired and stored.expires_at <= now:
-                await self._evict(live.key, "idle", expired_by=now)
-                self._close(live)
-                raise unknown_session(live.key)
-            if live.record is None or stored.version != live.stored_version:
-                self._show(live, records.decode(stored.data))
-            live.stored_version = stored.version
+        except StoreError:
+            if live.record is None or expired:
+                raise
+            return live.record  # as far as is known here
+        if stored is None or live.closed:
+            self._close(live)
+            raise await self._gone(live.key, lost=bool(live.revision) and stored is None)
+        if expired and stored.expires_at <= now:
+            idle_s = None if live.record is None else live.record.idle_timeout_s
+            await self._evict(live.key, self._idle(idle_s), expired_by=now)
+            self._close(live)
+            raise await self._gone(live.key)
+        if live.record is None or stored.revision != live.revision:
+            self._show(live, await self._decoded(live.key, stored))
+        live.revision, live.stored_expiry = stored.revision, stored.expires_at
         assert live.record is not None  # shown above
         return live.record
+
+    async def _decoded(self, key: SessionKey, stored: StoredSession) -> SceneRecord:
+        """The record in the bytes; bytes that are none are set aside, and said to be."""
+        try:
+            return records.decode(stored.data)
+        except UnknownFormatError as error:
+            # Another version of the service reads it, so it stays where it is.
+            raise ServiceError(
+                ErrorKind.STORE_UNAVAILABLE,
+                f"session_id: {quoted(key.id)} was stored by another version of the service: "
+                f"{error}",
+                retry_after_s=_RETRY_AFTER_FULL_S,
+            ) from error
+        except RecordError as error:
+            why = self._closure(DAMAGED, str(error))
+            if await self._store.quarantine(key, stored.revision, why):
+                log.exception("session set aside", session=key.id)
+                self._metrics.evictions.labels(DAMAGED).inc()
+                self._metrics.quarantined.set(await self._store.quarantined())
+                await self._count()
+            raise gone(key, why) from error
 
     async def _put(self, live: _Live, before: SceneRecord, change: Change) -> bool:
         """Puts a record in place; False when another replica has put one."""
         after = change.record
         if live.closed:
-            raise unknown_session(live.key)
+            raise await self._gone(live.key)
         expires_at = self._clock() + after.idle_timeout_s
         changed = (after.version, after.last_sequence) != (before.version, before.last_sequence)
         if self._store.durable and changed:
@@ -266,23 +403,42 @@ class Sessions:
             if not await self._write(live, after, packed, expires_at):
                 self._show(live, None)
                 return False
-        elif not await self._store.touch(live.key, expires_at):
+        elif not await self._touch(live, expires_at, self._slack_s(after)):
             self._close(live)
         if live.closed:
-            raise unknown_session(live.key)
+            raise await self._gone(live.key)
         live.expires_at = expires_at
         self._show(live, after)
         return True
+
+    async def _touch(self, live: _Live, expires_at: float, slack_s: float) -> bool:
+        """Tells the store that the session is used, unless it knows well enough."""
+        if live.stored_expiry >= expires_at:
+            return True
+        try:
+            open_still = await self._store.touch(live.key, expires_at + slack_s)
+        except StoreError:
+            return True  # nothing is lost by that; the next use tells it
+        live.stored_expiry = expires_at + slack_s
+        return open_still
 
     async def _write(
         self, live: _Live, record: SceneRecord, packed: bytes, expires_at: float
     ) -> bool:
         with self._metrics.stage("store"):
-            stored = StoredSession(record.version, expires_at, records.encode(record, packed))
-            if not await self._store.write(live.key, stored, live.stored_version):
+            stored = self._stored(record, packed, expires_at)
+            if not await self._store.write(live.key, stored, live.revision):
                 return False
-        live.stored_version = record.version
+        live.revision, live.stored_expiry = stored.revision, stored.expires_at
         return True
+
+    def _stored(self, record: SceneRecord, packed: bytes, expires_at: float) -> StoredSession:
+        data = records.encode(record, packed)
+        return StoredSession(new_revision(), expires_at + self._slack_s(record), data)
+
+    def _slack_s(self, record: SceneRecord) -> float:
+        """How much later than it must the store may close a session, so that it is told less."""
+        return min(_LONGEST_SLACK_S, record.idle_timeout_s / 20) if self._store.durable else 0.0
 
     async def _park(self, live: _Live) -> bool:
         if live.users or live.closed:
@@ -303,24 +459,44 @@ class Sessions:
         self._metrics.parked.inc()
         return True
 
-    async def _evict(self, key: SessionKey, reason: str, expired_by: float | None = None) -> bool:
+    def _closure(self, reason: str, detail: str = "") -> Closure:
+        return Closure(reason, self._clock(), detail, new_revision())
+
+    def _idle(self, idle_timeout_s: float | None = None) -> Closure:
+        detail = "" if idle_timeout_s is None else f"{idle_timeout_s:g} s unused"
+        return self._closure(IDLE, detail)
+
+    async def _gone(self, key: SessionKey, *, lost: bool = False) -> ServiceError:
+        """The error for a session that the store has not; ``lost``: though it was here before."""
+        closure = None
+        with suppress(StoreError):
+            closure = await self._store.closure(key)
+            if closure is None and lost:
+                log.error("session lost by the store", session=key.id)
+                self._metrics.evictions.labels(LOST).inc()
+                closure = self._closure(LOST, "its data is gone, and nobody closed it")
+        return gone(key, closure)
+
+    async def _evict(
+        self, key: SessionKey, closure: Closure, expired_by: float | None = None
+    ) -> bool:
         """Removes a session for good; whether this call was the one that did."""
-        live = self._live.get(key)
-        if not await self._store.delete(key, expired_by=expired_by):
+        async with self._lock(key):
+            return await self._remove(key, closure, expired_by)
+
+    async def _remove(self, key: SessionKey, closure: Closure, expired_by: float | None) -> bool:
+        """``_evict``, under the key's lock."""
+        before = self._live.get(key)
+        if not await self._store.delete(key, closure, expired_by=expired_by):
             return False
-        if live is not None:
-            self._close(live)
-        self._metrics.evictions.labels(reason).inc()
+        # Whoever came meanwhile may have read it before it went.
+        for live in (before, self._live.get(key)):
+            if live is not None:
+                self._close(live)
+        self._metrics.evictions.labels(closure.reason).inc()
         self._on_close(key)
         await self._count()
         return True
-
-    def _replace_live(self, live: _Live) -> None:
-        """Makes a new session the one that its key finds."""
-        old = self._live.get(live.key)
-        if old is not None:
-            self._close(old)
-        self._live[live.key] = live
 
     def _close(self, live: _Live) -> None:
         live.closed = True
@@ -341,9 +517,5 @@ class Sessions:
         self._metrics.sessions.set(await self._store.count())
 
 
-def unknown_session(key: SessionKey) -> ServiceError:
-    """The error for a session that does not exist, or not any more."""
-    return ServiceError(
-        ErrorKind.UNKNOWN_SESSION,
-        f"session_id: {quoted(key.id)} is unknown: it was never opened, was closed, or has expired",
-    )
+async def _looked_at(record: SceneRecord) -> tuple[Change, None]:
+    return Change(record), None

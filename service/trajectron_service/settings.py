@@ -88,6 +88,18 @@ class Settings(BaseSettings):
     park_after_s: Seconds = Field(
         30.0, description="A session unused for longer is kept as bytes in the store."
     )
+    store: str | None = Field(
+        None,
+        pattern=r"^(memory|sqlite(:.+)?|(redis|rediss|unix)://.+)$",
+        description="Where sessions are kept: `memory`, `sqlite:PATH` or `redis://HOST:PORT/DB`. "
+        "Unset: SQLite in `state_dir`, memory where there is none.",
+    )
+    store_durability: Literal["disk", "os", "none"] = Field(
+        "disk",
+        description="What an acknowledged frame survives at least: a loss of power, the end of any "
+        "process, or only the end of this one.",
+    )
+    store_timeout_s: Seconds = Field(5.0, description="Time for one operation of the store.")
     drain_grace_s: Seconds = Field(20.0, description="Time for work in hand after SIGTERM.")
 
     live_accuracy: bool = Field(

@@ -39,7 +39,15 @@ from trajectron_service.metrics import Metrics
 
 # Results that may wait under ``latest``, as a multiple of the window of forecasts.
 _RESULTS_PER_FORECAST = 64
-_ENDS_STREAM = frozenset({ErrorKind.UNKNOWN_SESSION, ErrorKind.DRAINING})
+_ENDS_STREAM = frozenset(
+    {
+        ErrorKind.UNKNOWN_SESSION,
+        ErrorKind.SESSION_DAMAGED,
+        ErrorKind.DRAINING,
+        # The frames may count or not: the client comes back and sends them again, in order.
+        ErrorKind.STORE_UNAVAILABLE,
+    }
+)
 
 # Folds frames into the stream's session: the answers, in order.
 Fold = Callable[[Sequence[FrameRequest], float | None], Awaitable[list[FrameAnswer]]]

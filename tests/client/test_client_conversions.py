@@ -281,13 +281,15 @@ def test_sessions_graphs_results_and_models_arrive_alike_on_both_transports() ->
     assert results[0].outcome is tc.Outcome.ACCEPTED_WITH_GAPS
     assert not results[0].refused
 
-    model = core.ModelInfo("zara1", "ff", ("pedestrian",), 0.4, 12, 25, True, {"seed": 3})
+    model = core.ModelInfo(
+        "zara1", "ff", ("pedestrian",), 0.4, 12, 25, True, {"seed": 3}, "x86-64-v3"
+    )
     models = operations.list_models()
     got = models.from_message(pb.ListModelsResponse(models=[grpc_convert.model_message(model)]))
     assert got == models.from_body(
         orjson.loads(orjson.dumps({"models": [http_encode.model_json(model)]}))
     )
-    assert got[0].provenance == {"seed": 3}
+    assert (got[0].provenance, got[0].kernels) == ({"seed": 3}, "x86-64-v3")
 
 
 def test_frames_from_arrays() -> None:

@@ -220,6 +220,7 @@ class GrpcDriver:
                 "name": model.name,
                 "hash": model.hash,
                 "agent_types": list(model.agent_types),
+                "kernels": model.kernels,
                 "dt_s": _seconds(model.dt),
                 "horizon": model.horizon,
                 "latent_values": model.latent_values,

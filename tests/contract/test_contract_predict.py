@@ -10,6 +10,8 @@ import pytest
 from tests.contract.drivers import CODES, Driver, RefusalError
 from tests.contract.scenes import DT_S, agent, frame, walking
 
+from trajectron_model import kernels
+
 pytestmark = pytest.mark.asyncio(loop_scope="session")
 
 
@@ -295,3 +297,7 @@ async def test_models_can_be_asked_for_by_name(driver: Driver) -> None:
     for model in await driver.list_models():
         forecast = await driver.predict(walking(), model=model["name"], num_samples=1)
         assert forecast["model"] == model["name"]
+
+
+async def test_models_say_what_computes_them(driver: Driver) -> None:
+    assert {model["kernels"] for model in await driver.list_models()} == {kernels.in_use()}

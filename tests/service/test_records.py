@@ -10,9 +10,7 @@ from tests.service.building import observation
 
 from trajectron_service import records
 from trajectron_service.messages import SessionConfig, UnknownTypes
-from trajectron_service.records import RecordError, SceneRecord
-from trajectron_service.stores import SessionKey, StoredSession
-from trajectron_service.stores.memory import MemoryStore
+from trajectron_service.records import RecordError, SceneRecord, UnknownFormatError
 from trajectron_service.timebase import Grid, Timeline, advance
 
 
@@ -49,26 +47,36 @@ def test_a_session_without_frames_has_bytes_too() -> None:
     assert (after.timeline.newest, after.states) == (None, ())
 
 
-@pytest.mark.parametrize("cut", [0, 3, 8, 40, 200])
-def test_damaged_bytes_are_refused(cut: int) -> None:
+@pytest.mark.parametrize("cut", [0, 3, 4, 8, 13, 40, 200, -1])
+def test_bytes_cut_short_are_refused(cut: int) -> None:
     with pytest.raises(RecordError):
-        records.decode(records.encode(lively(), b"")[:cut])
-    with pytest.raises(RecordError):
+        records.decode(records.encode(lively(), b"packed")[:cut])
+
+
+def test_a_single_wrong_bit_anywhere_is_refused() -> None:
+    data = records.encode(lively(), b"packed states")
+    for place in range(len(data)):
+        wrong = bytearray(data)
+        wrong[place] ^= 1 << (place % 8)
+        with pytest.raises(RecordError):
+            records.decode(bytes(wrong))
+
+
+def test_another_format_is_told_apart_from_damage() -> None:
+    data = records.encode(lively(), b"")
+    with pytest.raises(UnknownFormatError, match="version 3"):
+        records.decode(data[:3] + b"\x03" + data[4:])
+    with pytest.raises(RecordError) as refusal:
         records.decode(b"PK\x03\x04" + b"\0" * 50)
+    assert not isinstance(refusal.value, UnknownFormatError)
 
 
-async def test_the_store_compares_versions_before_it_sets() -> None:
-    store, key = MemoryStore(), SessionKey("t", "a")
-    assert await store.create(key, StoredSession(0, 10.0, b"0"))
-    assert not await store.create(key, StoredSession(0, 10.0, b"other"))
-    assert await store.write(key, StoredSession(1, 10.0, b"1"), expected_version=0)
-    assert not await store.write(key, StoredSession(1, 10.0, b"late"), expected_version=0)
-    assert await store.read(key) == StoredSession(1, 10.0, b"1")
-    assert await store.touch(key, 20.0)
-    assert await store.expired(19.9, 10) == []
-    assert await store.expired(20.0, 10) == [key]
-    assert not await store.delete(key, expired_by=19.9)
-    assert await store.delete(key, expired_by=20.0)
-    assert not await store.delete(key)
-    assert not await store.touch(key, 30.0)
-    assert not await store.write(key, StoredSession(2, 10.0, b"2"), expected_version=1)
+def test_each_agents_name_is_written_once() -> None:
+    timeline = Timeline(Grid.of(0.4, None, 2.0))
+    names = [f"agent-with-a-long-name-{k:04}" for k in range(40)]
+    for step in range(3):
+        places = {name: (step + 0.1, k + 0.2) for k, name in enumerate(names)}
+        timeline = advance(timeline, observation(step * 0.4, **places)).timeline
+    record = dataclasses.replace(lively(), timeline=timeline)
+    # Time, place, and what is left of the name after compression.
+    assert len(records.encode(record, b"")) < 40 * 50

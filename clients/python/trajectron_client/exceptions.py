@@ -23,6 +23,8 @@ TrajectronError
     │   ├── TooManyEvaluationsError
     │   ├── TooLargeError
     │   └── OverloadedError         the queue is full; see ``retry_after_s``
+    ├── SessionDamagedError         what was stored of the session cannot be read any more
+    ├── StoreUnavailableError       sessions cannot be stored now; ``retry_after_s``
     ├── DrainingError               the server is stopping; another replica may answer
     ├── DeadlineExceededError       no answer within ``timeout_s``
     ├── CancelledError
@@ -155,6 +157,14 @@ class OverloadedError(ResourceExhaustedError):
     """The server's queue is full; ``retry_after_s`` says when to try again."""
 
 
+class SessionDamagedError(ServiceError):
+    """What the service had stored of the session cannot be read; it is kept aside there."""
+
+
+class StoreUnavailableError(ServiceError):
+    """The service cannot store sessions now: what was sent may count or not; try it again."""
+
+
 class DrainingError(ServiceError):
     """The server is stopping and takes no new work."""
 
@@ -175,6 +185,7 @@ BY_REASON: dict[str, type[ServiceError]] = {
     "INVALID_ARGUMENT": InvalidArgumentError,
     "MALFORMED": MalformedError,
     "UNKNOWN_SESSION": UnknownSessionError,
+    "SESSION_DAMAGED": SessionDamagedError,
     "UNKNOWN_MODEL": UnknownModelError,
     "UNKNOWN_AGENT": UnknownAgentError,
     "SESSION_EXISTS": SessionExistsError,
@@ -190,6 +201,7 @@ BY_REASON: dict[str, type[ServiceError]] = {
     "TOO_LARGE": TooLargeError,
     "OVERLOADED": OverloadedError,
     "DRAINING": DrainingError,
+    "STORE_UNAVAILABLE": StoreUnavailableError,
     "DEADLINE_EXCEEDED": DeadlineExceededError,
     "CANCELLED": CancelledError,
     "INTERNAL": InternalError,

@@ -142,4 +142,5 @@ def to_model_info(body: Json) -> ModelInfo:
         latent_values=body["latent_values"],
         is_default=body["is_default"],
         provenance=body["provenance"],
+        kernels=body.get("kernels", ""),
     )

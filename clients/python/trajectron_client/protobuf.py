@@ -204,4 +204,5 @@ def to_model_info(message: pb.Model) -> ModelInfo:
         latent_values=message.latent_values,
         is_default=message.is_default,
         provenance=json.loads(message.provenance_json or "{}"),
+        kernels=message.kernels,
     )

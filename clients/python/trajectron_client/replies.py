@@ -165,6 +165,8 @@ class ModelInfo:
         latent_values: the number of modes Z.
         is_default: whether requests that name no model get this one.
         provenance: task, data, split, seed, metrics, licence note: JSON values.
+        kernels: what computes it: the instruction set of the server's compiled kernels, or
+            torch and why; empty from a server that does not say.
     """
 
     name: str
@@ -175,3 +177,4 @@ class ModelInfo:
     latent_values: int
     is_default: bool
     provenance: Mapping[str, object]
+    kernels: str = ""

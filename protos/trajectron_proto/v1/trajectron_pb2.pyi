@@ -1360,6 +1360,7 @@ class Model(_message.Message):
     LATENT_VALUES_FIELD_NUMBER: _builtins.int
     IS_DEFAULT_FIELD_NUMBER: _builtins.int
     PROVENANCE_JSON_FIELD_NUMBER: _builtins.int
+    KERNELS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     hash: _builtins.str
     """sha256 of the weights, hexadecimal."""
@@ -1370,6 +1371,8 @@ class Model(_message.Message):
     """Whether requests that name no model get this one."""
     provenance_json: _builtins.str
     """JSON: task, data, split, seed, metrics, licence note."""
+    kernels: _builtins.str
+    """What computes it: the instruction set of the compiled kernels, or torch and why."""
     @_builtins.property
     def agent_types(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -1385,10 +1388,11 @@ class Model(_message.Message):
         latent_values: _builtins.int = ...,
         is_default: _builtins.bool = ...,
         provenance_json: _builtins.str = ...,
+        kernels: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["dt", b"dt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_types", b"agent_types", "dt", b"dt", "hash", b"hash", "horizon", b"horizon", "is_default", b"is_default", "latent_values", b"latent_values", "name", b"name", "provenance_json", b"provenance_json"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_types", b"agent_types", "dt", b"dt", "hash", b"hash", "horizon", b"horizon", "is_default", b"is_default", "kernels", b"kernels", "latent_values", b"latent_values", "name", b"name", "provenance_json", b"provenance_json"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -44,7 +44,7 @@ def models(
 
 
 def _info(name_or_path: str) -> ModelInfo:
-    from trajectron_model import registry
+    from trajectron_model import kernels, registry
 
     description = registry.describe(name_or_path)
     config = description.config
@@ -57,6 +57,7 @@ def _info(name_or_path: str) -> ModelInfo:
         latent_values=config.latent_values,
         is_default=name_or_path == registry.DEFAULT,
         provenance=description.provenance,
+        kernels=kernels.in_use(),
     )
 
 

@@ -1,0 +1,171 @@
+/* Vectors as wide as the instruction set's, and the functions that the kernels need of them.
+ *
+ * Plain C with the vector extensions of GCC and clang: the same source for every instruction
+ * set, the width chosen by the flags that it is compiled with. Each lane's result depends on
+ * that lane alone, so it does not matter beside which other values one is computed.
+ */
+#ifndef TRAJECTRON_SIMD_H
+#define TRAJECTRON_SIMD_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#define LANES 16
+#define TILE_ROWS 6 /* 6 x 4 sums, 4 weights and 1 input in 32 registers */
+#elif defined(__AVX__)
+#include <immintrin.h>
+#define LANES 8
+#define TILE_ROWS 3 /* 3 x 4 sums, 3 inputs and 1 weight in 16 registers */
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#define LANES 4
+#define TILE_ROWS 6
+#else
+#include <emmintrin.h>
+#define LANES 4
+#define TILE_ROWS 2
+#endif
+
+/* A panel of packed weights is 4 vectors wide: see gemm_tile. */
+#define PANEL_VECTORS 4
+#define PANEL_COLUMNS (PANEL_VECTORS * LANES)
+
+#define KERNEL __attribute__((visibility("default")))
+#define INLINE static inline __attribute__((always_inline))
+
+typedef float vf __attribute__((vector_size(LANES * 4)));
+typedef int32_t vi __attribute__((vector_size(LANES * 4)));
+
+INLINE vf vf_load(const float *from) {
+    vf v;
+    memcpy(&v, from, sizeof v);
+    return v;
+}
+
+INLINE void vf_store(float *to, vf v) { memcpy(to, &v, sizeof v); }
+
+INLINE vf vf_all(float x) { return (vf){0} + x; }
+
+/* The smaller and the larger; NaN if x is NaN. */
+INLINE vf vf_min(vf bound, vf x) {
+#if defined(__AVX512F__)
+    return (vf)_mm512_min_ps((__m512)bound, (__m512)x);
+#elif defined(__AVX__)
+    return (vf)_mm256_min_ps((__m256)bound, (__m256)x);
+#elif defined(__aarch64__)
+    return (vf)vminq_f32((float32x4_t)bound, (float32x4_t)x);
+#else
+    return (vf)_mm_min_ps((__m128)bound, (__m128)x);
+#endif
+}
+
+INLINE vf vf_max(vf bound, vf x) {
+#if defined(__AVX512F__)
+    return (vf)_mm512_max_ps((__m512)bound, (__m512)x);
+#elif defined(__AVX__)
+    return (vf)_mm256_max_ps((__m256)bound, (__m256)x);
+#elif defined(__aarch64__)
+    return (vf)vmaxq_f32((float32x4_t)bound, (float32x4_t)x);
+#else
+    return (vf)_mm_max_ps((__m128)bound, (__m128)x);
+#endif
+}
+
+INLINE vf vf_sqrt(vf x) {
+    vf root;
+    for (int lane = 0; lane < LANES; lane++) root[lane] = sqrtf(x[lane]);
+    return root;
+}
+
+/* Always in this order, whatever the width of the loop around it. */
+INLINE float vf_sum(vf x) {
+    float sum = 0.0f;
+    for (int width = LANES / 2; width > 0; width /= 2)
+        for (int lane = 0; lane < width; lane++) x[lane] += x[lane + width];
+    sum = x[0];
+    return sum;
+}
+
+INLINE float vf_largest(vf x) {
+    float largest = x[0];
+    for (int lane = 1; lane < LANES; lane++) largest = x[lane] > largest ? x[lane] : largest;
+    return largest;
+}
+
+/* e^x to about 1 unit in the last place, for x held to [-87, 88].
+ *
+ * x = n ln 2 + r with |r| <= ln(2)/2; e^r by its Taylor series to r^6 (the next term is below
+ * 2^-23 / 2), with n added to the exponent. n is rounded by adding a number so large that the
+ * fraction falls off; its bits then end in n.
+ */
+INLINE vf vf_exp(vf x) {
+    const float round_by = 12582912.0f; /* 1.5 x 2^23 */
+    x = vf_min(vf_all(88.0f), vf_max(vf_all(-87.0f), x));
+    vf shifted = x * 1.44269504f + round_by;
+    vf n = shifted - round_by;
+    vf r = x - n * 0.693359375f; /* ln 2 in two parts: the first product is exact */
+    r = r + n * 2.12194440e-4f;
+    vf e = vf_all(1.0f / 720.0f);
+    e = e * r + 1.0f / 120.0f;
+    e = e * r + 1.0f / 24.0f;
+    e = e * r + 1.0f / 6.0f;
+    e = e * r + 0.5f;
+    e = e * r + 1.0f;
+    e = e * r + 1.0f;
+    return (vf)((vi)e + ((vi)shifted << 23));
+}
+
+/* 1 / (1 + e^-x) */
+INLINE vf vf_sigmoid(vf x) { return 1.0f / (1.0f + vf_exp(-x)); }
+
+/* (e^2x - 1) / (e^2x + 1): absolute error below 1e-7, which is what gates need. */
+INLINE vf vf_tanh(vf x) {
+    vf e = vf_exp(2.0f * vf_min(vf_all(10.0f), vf_max(vf_all(-10.0f), x)));
+    return (e - 1.0f) / (e + 1.0f);
+}
+
+/* ln x for normal x > 0 (Cephes' scheme: x = m 2^n with m in [sqrt(1/2), sqrt(2)), and
+ * ln m = 2 artanh((m - 1) / (m + 1)) by its series). */
+INLINE vf vf_log(vf x) {
+    const int32_t root_half = 0x3f3504f3;
+    vi bits = (vi)x - root_half;
+    vi n = bits >> 23;
+    vf m = (vf)((bits & 0x7fffff) + root_half);
+    vf s = (m - 1.0f) / (m + 1.0f);
+    vf s2 = s * s;
+    vf p = vf_all(2.0f / 9.0f);
+    p = p * s2 + 2.0f / 7.0f;
+    p = p * s2 + 2.0f / 5.0f;
+    p = p * s2 + 2.0f / 3.0f;
+    p = p * s2 * s + 2.0f * s;
+    return p + __builtin_convertvector(n, vf) * 0.693147181f;
+}
+
+/* sums[row][vector] += inputs[row][k] * panel[k][vector] for TILE_ROWS rows, k in order.
+ *
+ * panel: [depth][PANEL_VECTORS][LANES] packed weights; inputs: rows `stride` floats apart. Each
+ * sum is made in the order of k whatever row of a tile it is in: a row's result does not depend
+ * on its neighbours.
+ */
+INLINE void gemm_tile(const float *panel, long depth, const float *inputs, long stride,
+                      vf sums[TILE_ROWS][PANEL_VECTORS]) {
+    vf held[TILE_ROWS][PANEL_VECTORS];
+    memcpy(held, sums, sizeof held);
+    for (long k = 0; k < depth; k++) {
+        vf weights[PANEL_VECTORS];
+#pragma GCC unroll 4
+        for (int v = 0; v < PANEL_VECTORS; v++) weights[v] = vf_load(panel + (k * PANEL_VECTORS + v) * LANES);
+#pragma GCC unroll 6
+        for (int row = 0; row < TILE_ROWS; row++) {
+            vf input = vf_all(inputs[row * stride + k]);
+#pragma GCC unroll 4
+            for (int v = 0; v < PANEL_VECTORS; v++) held[row][v] += input * weights[v];
+        }
+    }
+    memcpy(sums, held, sizeof held);
+}
+
+#endif

@@ -1,0 +1,146 @@
+"""Kernels are compiled where they can be, and used only where they fit; else torch works."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from trajectron_model.kernels import build, in_use, kernels, loading
+from trajectron_model.kernels.dense import linear
+
+ROOT = Path(__file__).parents[2]
+
+needs_kernels = pytest.mark.skipif(kernels() is None, reason=in_use())
+
+
+def asked_with(switch: str) -> str:
+    """What a new process says is in use."""
+    code = "from trajectron_model import kernels; print(kernels.in_use())"
+    ran = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, loading.SWITCH: switch, "PYTHONPATH": str(ROOT / "model")},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return ran.stdout.strip()
+
+
+def test_where_there_is_a_compiler_make_install_has_compiled_kernels() -> None:
+    if not build.variants() or build.find_compiler() is None:
+        pytest.skip("no kernels for this machine, or no compiler")
+    library = kernels()
+    assert library is not None, in_use()
+    assert library.variant == in_use()
+    assert library.lanes >= 4
+
+
+@needs_kernels
+def test_the_switch_turns_them_off_and_says_so() -> None:
+    assert asked_with("off") == "torch: TRAJECTRON_KERNELS=off"
+    assert asked_with("auto") == in_use()
+
+
+@needs_kernels
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="several sets on x86-64 only")
+def test_a_processor_gets_the_widest_instruction_set_that_it_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names: dict[str, object] = {}
+    for variant in build.variants():
+        monkeypatch.setattr(loading, "_processor_flags", lambda v=variant: v.needs)
+        monkeypatch.setattr(loading, "_load", lambda _path, name: name)
+        names[variant.name] = loading._found.__wrapped__()
+    assert names == {variant.name: variant.name for variant in build.variants()}
+    monkeypatch.setattr(loading, "_processor_flags", frozenset)
+    found = loading._found.__wrapped__()
+    assert isinstance(found, loading.Unavailable)
+    assert "none for this processor" in found.reason
+
+
+@needs_kernels
+def test_a_library_older_than_its_sources_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "fingerprint", lambda: "of changed sources")
+    found = loading._found.__wrapped__()
+    assert isinstance(found, loading.Unavailable)
+    assert "older than its sources" in found.reason
+
+
+def test_a_broken_library_is_not_called(tmp_path: Path) -> None:
+    path = tmp_path / "trajectron-broken.so"
+    path.write_bytes(b"no library")
+    found = asked_with(str(path))
+    assert found.startswith("torch: trajectron-broken.so cannot be loaded")
+
+
+def test_what_the_compiler_says_is_passed_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = build.find_compiler()
+    if compiler is None or not build.variants():
+        pytest.skip("no compiler")
+    (tmp_path / "wrong.c").write_text("int f(void) { return missing; }")
+    monkeypatch.setattr(build, "SOURCES", tmp_path)
+    with pytest.raises(build.BuildError, match="missing"):
+        build.compile_library(compiler, build.variants()[-1], tmp_path / "wrong.so")
+    assert not list(tmp_path.glob("*.so*")) + list(tmp_path.glob("*partial*"))
+
+
+@needs_kernels
+def test_the_wheel_carries_them_and_names_its_platform(tmp_path: Path) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith(f"-py3-none-linux_{platform.machine()}.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    folder = "trajectron_model/kernels/"
+    assert {f"{folder}lib/{v.file_name}" for v in build.variants()} <= names
+    # Its fingerprint is compared with the sources: they are in the wheel too.
+    assert {folder + path.name for path in build.sources()} <= names
+
+
+@needs_kernels
+@pytest.mark.parametrize(("rows", "depth", "columns"), [(1, 1, 1), (7, 40, 512), (5, 3, 33)])
+def test_a_linear_layer_is_torchs_and_its_rows_stand_alone(
+    rows: int, depth: int, columns: int
+) -> None:
+    torch.manual_seed(rows)
+    layer, inputs = torch.nn.Linear(depth, columns), torch.randn(rows, depth)
+    with torch.inference_mode():
+        ours, theirs = linear(layer, inputs), layer(inputs)
+        assert ours.shape == theirs.shape
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+        for row in range(rows):
+            assert torch.equal(linear(layer, inputs[row : row + 1]), ours[row : row + 1])
+
+
+@needs_kernels
+def test_weights_are_packed_again_when_they_change() -> None:
+    layer, inputs = torch.nn.Linear(3, 4), torch.ones(1, 3)
+    with torch.no_grad():
+        before = linear(layer, inputs)
+        layer.bias.add_(1.0)
+        torch.testing.assert_close(linear(layer, inputs), before + 1.0)
+        layer.weight = torch.nn.Parameter(torch.zeros(4, 3))
+        torch.testing.assert_close(linear(layer, inputs)[0], layer.bias)
+
+
+def test_gradients_flow_where_they_are_asked_for() -> None:
+    layer = torch.nn.Linear(3, 4)
+    linear(layer, torch.ones(1, 3)).sum().backward()
+    assert layer.weight.grad is not None
+    doubles = torch.nn.Linear(3, 4).double()
+    with torch.no_grad():
+        assert linear(doubles, torch.ones(1, 3).double()).dtype is torch.float64
