@@ -89,7 +89,7 @@ class Application:
         self._clock = clock or steady_unix_clock()
         self._choices = Choices(settings, engine.models, engine.default_model, draw_seed)
         self._batcher = Batcher[SceneJob, SceneResult](
-            engine.run,
+            self._run,
             queue_size=settings.queue_size,
             max_batch_cost=settings.max_batch_points,
             report=self._note_batch,
@@ -401,6 +401,11 @@ class Application:
             raise ServiceError(
                 ErrorKind.DEADLINE_EXCEEDED, "the deadline passed before the work was done"
             ) from error
+
+    def _run(self, jobs: Sequence[SceneJob]) -> Sequence[SceneResult]:
+        """A batch, on the inference thread."""
+        with self._metrics.tracing.batch([job.ticket for job in jobs]):
+            return self._engine.run(jobs)
 
     def _note_batch(self, report: BatchReport) -> None:
         self._metrics.batch_jobs.observe(report.entries)

@@ -254,6 +254,9 @@ class Forecaster:
     async def _submit(
         self, job: SceneJob, key: Hashable, cost: float, deadline: float | None
     ) -> SceneResult:
+        ticket = self._metrics.tracing.ticket()
+        if ticket is not None:
+            job = dataclasses.replace(job, ticket=ticket)
         try:
             return await self._batcher.submit(job, key=key, cost=cost, deadline=deadline)
         except QueueFull as error:

@@ -23,6 +23,7 @@ from prometheus_client import (
 from trajectron_model.evaluation import metrics
 from trajectron_model.evaluation.densities import LEVELS
 from trajectron_model.evaluation.live import LiveScores
+from trajectron_service.tracing import OFF, Tracing
 
 # From a quarter of a millisecond to some seconds; 0.4 s is the usual model's step.
 SECONDS = (
@@ -131,9 +132,14 @@ class AccuracyMetrics:
 
 
 class Metrics:
-    """What operators see. One object per application; safe to use from any thread."""
+    """What operators see. One object per application; safe to use from any thread.
 
-    def __init__(self) -> None:
+    Args:
+        tracing: told of the stages too; whoever has the metrics finds it here.
+    """
+
+    def __init__(self, tracing: Tracing = OFF) -> None:
+        self.tracing = tracing
         disable_created_metrics()  # when a series began is of no use, and doubles the output
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
@@ -288,9 +294,15 @@ class Metrics:
         """Times the block as one stage."""
         start = time.perf_counter()
         try:
-            yield
+            with self.tracing.stage(stage):
+                yield
         finally:
             self.stage_seconds.labels(stage).observe(time.perf_counter() - start)
+
+    def staged(self, stage: Stage, seconds: float) -> None:
+        """Notes a stage of a batch that has just ended, on the inference thread."""
+        self.stage_seconds.labels(stage).observe(seconds)
+        self.tracing.staged(stage, seconds)
 
     def render(self) -> bytes:
         """All metrics in the Prometheus text format (``CONTENT_TYPE``)."""

@@ -136,6 +136,16 @@ class Settings(BaseSettings):
         "to; `low`: at the lowest nice value.",
     )
 
+    tracing: Literal["off", "otlp"] = Field(
+        "off", description="Where spans of requests go; `otlp` needs the extra `tracing`."
+    )
+    tracing_endpoint: str = Field(
+        "http://127.0.0.1:4318", description="Collector of spans: OTLP over HTTP."
+    )
+    tracing_share: float = Field(
+        1.0, ge=0.0, le=1.0, description="Share of traces kept where the client does not say."
+    )
+
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Level.")
     log_format: Literal["console", "json"] = Field("console", description="Form of log lines.")
 

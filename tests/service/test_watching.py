@@ -46,7 +46,7 @@ HORIZON = 12
 SEED = 3
 ASK = ForecastOptions(num_samples=1, horizon=HORIZON, seed=1)
 # Lets every forecast in.
-ALL = {"live_accuracy_budget": 1000.0}
+ALL: dict[str, Any] = {"live_accuracy_budget": 1000.0}
 
 
 def watching(app: Application) -> LiveAccuracy:
@@ -130,7 +130,7 @@ def columns_of(network: Trajectron, recording: Recording) -> dict[str, NDArray[n
 def assert_same_as_offline(
     app: Application, model: str, columns: dict[str, NDArray[np.float64]]
 ) -> None:
-    kind = {"model": model, "type": "pedestrian"}
+    kind: dict[str, object] = {"model": model, "type": "pedestrian"}
     agents = len(columns["ade_mean"])
     assert outcomes(app)["scored"] == agents > 50
     for point in ("mean", "mode"):
