@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from trajectron_model.config import ModelConfig
 from trajectron_model.gmm import BivariateMixture, choose, correlated
 from trajectron_model.integration import limit_speed
+from trajectron_model.kernels import decoding
 from trajectron_model.kernels.dense import linear
 
 _CORRELATION_BOUND = 0.98
@@ -152,6 +153,9 @@ class Decoder(nn.Module):
             normal: [R, H, 2] standard normals.
             limit: on speed, in units of the speed scale; what is fed back is limited too.
         """
+        done = decoding.sample(self, prepared, agent, latent, uniform, normal, limit)
+        if done is not None:
+            return done
         sampled = torch.empty_like(normal)
         for rows in _blocks(len(agent)):
             start = self.start(prepared, agent[rows], latent[rows])
@@ -185,6 +189,9 @@ class Decoder(nn.Module):
             [N Z, H, 3].
         """
         agent, latent = self.every_latent(len(prepared.velocity))
+        done = decoding.moments(self, prepared, agent, latent, horizon, limit)
+        if done is not None:
+            return done
         means = prepared.velocity.new_empty(len(agent), horizon, 2)
         covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
         for rows in _blocks(len(agent)):

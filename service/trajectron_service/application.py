@@ -276,7 +276,7 @@ class Application:
         with self._work.taken():
             if options.forecast is not None:
                 self._choices.check_options(options.forecast)
-            session, resumed = await self._open(session_id, config)
+            session, resumed = await self._open(session_id, config, must_exist=options.must_exist)
             key = _key(session.id)
             before = self._streams.get(key)
             if before is not None:
@@ -300,10 +300,12 @@ class Application:
             return stream
 
     async def _open(
-        self, session_id: str | None, config: SessionConfig
+        self, session_id: str | None, config: SessionConfig, *, must_exist: bool
     ) -> tuple[SessionInfo, bool]:
         """The session, and whether it was there already."""
         key = _key(chosen.session_id(session_id))
+        if must_exist:
+            return await self._sessions.info(key), True
         if session_id:
             with _past(ErrorKind.UNKNOWN_SESSION):
                 return await self._sessions.info(key), True

@@ -47,7 +47,8 @@ INLINE vf vf_load(const float *from) {
 
 INLINE void vf_store(float *to, vf v) { memcpy(to, &v, sizeof v); }
 
-INLINE vf vf_all(float x) { return (vf){0} + x; }
+/* x - 0 is x, so that this is one instruction; 0 + x is not, for x = -0. */
+INLINE vf vf_all(float x) { return x - (vf){0}; }
 
 /* The smaller and the larger; NaN if x is NaN. */
 INLINE vf vf_min(vf bound, vf x) {
@@ -80,13 +81,13 @@ INLINE vf vf_sqrt(vf x) {
     return root;
 }
 
-/* Always in this order, whatever the width of the loop around it. */
+/* The sum of all lanes, always added up in this order. */
 INLINE float vf_sum(vf x) {
-    float sum = 0.0f;
+    float lanes[LANES];
+    vf_store(lanes, x);
     for (int width = LANES / 2; width > 0; width /= 2)
-        for (int lane = 0; lane < width; lane++) x[lane] += x[lane + width];
-    sum = x[0];
-    return sum;
+        for (int lane = 0; lane < width; lane++) lanes[lane] += lanes[lane + width];
+    return lanes[0];
 }
 
 INLINE float vf_largest(vf x) {
@@ -95,15 +96,14 @@ INLINE float vf_largest(vf x) {
     return largest;
 }
 
-/* e^x to about 1 unit in the last place, for x held to [-87, 88].
+/* e^x to about 1 unit in the last place, for x in [-87, 88].
  *
  * x = n ln 2 + r with |r| <= ln(2)/2; e^r by its Taylor series to r^6 (the next term is below
- * 2^-23 / 2), with n added to the exponent. n is rounded by adding a number so large that the
+ * 2^-23 / 2), times 2^n (so that NaN stays NaN). n is rounded by adding a number so large that the
  * fraction falls off; its bits then end in n.
  */
-INLINE vf vf_exp(vf x) {
+INLINE vf vf_exp_within(vf x) {
     const float round_by = 12582912.0f; /* 1.5 x 2^23 */
-    x = vf_min(vf_all(88.0f), vf_max(vf_all(-87.0f), x));
     vf shifted = x * 1.44269504f + round_by;
     vf n = shifted - round_by;
     vf r = x - n * 0.693359375f; /* ln 2 in two parts: the first product is exact */
@@ -115,15 +115,20 @@ INLINE vf vf_exp(vf x) {
     e = e * r + 0.5f;
     e = e * r + 1.0f;
     e = e * r + 1.0f;
-    return (vf)((vi)e + ((vi)shifted << 23));
+    return e * (vf)(((vi)shifted << 23) + 0x3f800000);
 }
+
+INLINE vf vf_clamp(vf x, float bound) { return vf_min(vf_all(bound), vf_max(vf_all(-bound), x)); }
+
+/* e^x, for x held to [-87, 87]. */
+INLINE vf vf_exp(vf x) { return vf_exp_within(vf_clamp(x, 87.0f)); }
 
 /* 1 / (1 + e^-x) */
 INLINE vf vf_sigmoid(vf x) { return 1.0f / (1.0f + vf_exp(-x)); }
 
 /* (e^2x - 1) / (e^2x + 1): absolute error below 1e-7, which is what gates need. */
 INLINE vf vf_tanh(vf x) {
-    vf e = vf_exp(2.0f * vf_min(vf_all(10.0f), vf_max(vf_all(-10.0f), x)));
+    vf e = vf_exp_within(2.0f * vf_clamp(x, 10.0f));
     return (e - 1.0f) / (e + 1.0f);
 }
 
@@ -144,28 +149,31 @@ INLINE vf vf_log(vf x) {
     return p + __builtin_convertvector(n, vf) * 0.693147181f;
 }
 
-/* sums[row][vector] += inputs[row][k] * panel[k][vector] for TILE_ROWS rows, k in order.
+/* sums[row][vector] += inputs[row][k] * panel[k][vector], k in order.
  *
- * panel: [depth][PANEL_VECTORS][LANES] packed weights; inputs: rows `stride` floats apart. Each
- * sum is made in the order of k whatever row of a tile it is in: a row's result does not depend
- * on its neighbours.
+ * panel: [depth][vectors][LANES] packed weights; inputs: rows `stride` floats apart; sums:
+ * [rows][vectors]. Each sum is made in the order of k whatever row of a tile it is in: a row's
+ * result does not depend on its neighbours. rows and vectors are constants where this is used,
+ * so that the sums stay in registers.
  */
-INLINE void gemm_tile(const float *panel, long depth, const float *inputs, long stride,
-                      vf sums[TILE_ROWS][PANEL_VECTORS]) {
-    vf held[TILE_ROWS][PANEL_VECTORS];
-    memcpy(held, sums, sizeof held);
+INLINE void gemm_tile(const int rows, const int vectors, const float *panel, long depth,
+                      const float *inputs, long stride, vf *sums) {
+    vf held[4 * TILE_ROWS];
+#pragma GCC unroll 24
+    for (int i = 0; i < rows * vectors; i++) held[i] = sums[i];
     for (long k = 0; k < depth; k++) {
         vf weights[PANEL_VECTORS];
 #pragma GCC unroll 4
-        for (int v = 0; v < PANEL_VECTORS; v++) weights[v] = vf_load(panel + (k * PANEL_VECTORS + v) * LANES);
-#pragma GCC unroll 6
-        for (int row = 0; row < TILE_ROWS; row++) {
+        for (int v = 0; v < vectors; v++) weights[v] = vf_load(panel + (k * vectors + v) * LANES);
+#pragma GCC unroll 12
+        for (int row = 0; row < rows; row++) {
             vf input = vf_all(inputs[row * stride + k]);
 #pragma GCC unroll 4
-            for (int v = 0; v < PANEL_VECTORS; v++) held[row][v] += input * weights[v];
+            for (int v = 0; v < vectors; v++) held[row * vectors + v] += input * weights[v];
         }
     }
-    memcpy(sums, held, sizeof held);
+#pragma GCC unroll 24
+    for (int i = 0; i < rows * vectors; i++) sums[i] = held[i];
 }
 
 #endif

@@ -1,0 +1,249 @@
+"""Rollouts of a decoder by ``decode.c``; the torch code beside ``Decoder.sample`` is the reference.
+
+Shape letters as in ``shapes``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from trajectron_model.kernels.loading import Kernels
+from trajectron_model.kernels.packing import (
+    PANEL_VECTORS,
+    PackedWeights,
+    library_for,
+    padded,
+    panels,
+)
+from trajectron_model.kernels.threads import share
+
+if TYPE_CHECKING:
+    from trajectron_model.decoder import Decoder, Prepared
+
+_LOGIT_VECTORS = 2  # as in decode.c
+# Fewer rows are not worth waking a thread for.
+_LEAST_ROWS = 24
+# A logit so low that a component that only fills a vector has no weight.
+_NO_WEIGHT = -1e30
+
+
+class _DecoderStruct(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("size", "units", "components", "padded")),
+        *((name, ctypes.c_int64) for name in ("logits", "outputs")),
+        ("recurrent", ctypes.c_void_p),
+        ("gates_latent", ctypes.c_void_p),
+        ("start_latent", ctypes.c_void_p),
+        ("logit_weight", ctypes.c_void_p),
+        ("logit_bias", ctypes.c_void_p),
+        ("chosen_weight", ctypes.c_void_p),
+        ("chosen_bias", ctypes.c_void_p),
+        ("head_weight", ctypes.c_void_p),
+        ("head_bias", ctypes.c_void_p),
+        ("log_sigma_min", ctypes.c_float),
+        ("log_sigma_span", ctypes.c_float),
+    )
+
+
+class _RolloutsStruct(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("gates", "state", "velocity")),
+        *((name, ctypes.c_void_p) for name in ("order", "agent", "latent")),
+        ("horizon", ctypes.c_int64),
+        ("limit", ctypes.c_float),
+    )
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A decoder's weights in the kernel's order; ``tensors`` keeps alive what it points to."""
+
+    struct: _DecoderStruct
+    tensors: tuple[Tensor, ...]
+    workspace_bytes: int
+
+
+class _Asked(NamedTuple):
+    """Rollouts, as ``Decoder.sample`` is told of them."""
+
+    prepared: Prepared
+    agent: Tensor  # [R]
+    latent: Tensor  # [R]
+    horizon: int
+    limit: float
+
+
+def sample(
+    decoder: Decoder,
+    prepared: Prepared,
+    agent: Tensor,
+    latent: Tensor,
+    uniform: Tensor,
+    normal: Tensor,
+    limit: float,
+) -> Tensor | None:
+    """``Decoder.sample`` by the kernel; None where torch has to do it."""
+    library = library_for(decoder, *prepared, uniform, normal)
+    if library is None:
+        return None
+    rows, horizon = uniform.shape
+    assert normal.shape == (rows, horizon, 2)
+    uniform, normal = uniform.contiguous(), normal.contiguous()
+    out = torch.empty_like(normal)
+    function = library.library.trajectron_decode_sample
+    pointers = [_pointer(t) for t in (uniform, normal, out)]
+    asked = _Asked(prepared, agent, latent, horizon, limit)
+    _run(decoder, library, asked, function, pointers)
+    return out
+
+
+def moments(
+    decoder: Decoder, prepared: Prepared, agent: Tensor, latent: Tensor, horizon: int, limit: float
+) -> tuple[Tensor, Tensor] | None:
+    """``Decoder.moments`` by the kernel; None where torch has to do it."""
+    library = library_for(decoder, *prepared)
+    if library is None:
+        return None
+    means = prepared.velocity.new_empty(len(agent), horizon, 2)
+    covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
+    function = library.library.trajectron_decode_moments
+    pointers = [_pointer(means), _pointer(covariances)]
+    asked = _Asked(prepared, agent, latent, horizon, limit)
+    _run(decoder, library, asked, function, pointers)
+    return means, covariances
+
+
+def _run(
+    decoder: Decoder,
+    library: Kernels,
+    asked: _Asked,
+    function: Callable[..., None],
+    arrays: list[ctypes.c_void_p],
+) -> None:
+    """Calls the kernel on all rows, shared among threads.
+
+    Raises:
+        IndexError: an agent or a latent value out of range: the kernel would read beyond.
+    """
+    prepared = asked.prepared
+    agents, latents = asked.agent.contiguous().numpy(), asked.latent.contiguous().numpy()
+    values = decoder.gates_latent.num_embeddings
+    if not agents.size:
+        return
+    if agents.min() < 0 or agents.max() >= len(prepared.velocity):
+        raise IndexError(f"agents must be rows of {len(prepared.velocity)}")
+    if latents.min() < 0 or latents.max() >= values:
+        raise IndexError(f"latent values must lie in 0 .. {values - 1}")
+    gates, state, velocity = (column.contiguous() for column in prepared)
+    assert gates.shape[1] == 4 * decoder.size and state.shape[1] == 2 * decoder.size
+    order = _order(agents * values + latents, len(prepared.velocity) * values)
+    packed = _PACKED.of(decoder, library)
+    rollouts = _RolloutsStruct(
+        gates.data_ptr(),
+        state.data_ptr(),
+        velocity.data_ptr(),
+        order.ctypes.data,
+        agents.ctypes.data,
+        latents.ctypes.data,
+        asked.horizon,
+        asked.limit,
+    )
+
+    def work(first: int, last: int) -> None:
+        space = np.empty(packed.workspace_bytes + 64, dtype=np.uint8)
+        aligned = -space.ctypes.data % 64 + space.ctypes.data
+        span = (ctypes.c_int64(first), ctypes.c_int64(last), ctypes.c_void_p(aligned))
+        function(ctypes.byref(packed.struct), ctypes.byref(rollouts), *arrays, *span)
+
+    share(len(order), _LEAST_ROWS, work)
+
+
+def _order(key: np.ndarray, keys: int) -> np.ndarray:
+    """Rows [R] so that equal keys stand together; numpy sorts small integers quicker."""
+    small = key.astype(np.uint16) if keys <= 1 << 16 else key
+    return np.argsort(small, kind="stable").astype(np.int64, copy=False)
+
+
+def _pointer(tensor: Tensor) -> ctypes.c_void_p:
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def _pack(module: nn.Module, library: Kernels) -> _Packed:
+    decoder, lanes = cast("Decoder", module), library.lanes
+    size, components = decoder.size, decoder.components
+    units, many = _up(size, lanes), _up(components, lanes)
+    logits = _up(components, _LOGIT_VECTORS * lanes)
+    weight, bias = decoder.head.weight.detach(), decoder.head.bias.detach()
+    kinds, kind_bias = _by_kind(weight, bias, units, many)
+    numbers = weight[components:].reshape(components, 5, size)
+    chosen = weight.new_zeros(components, 5, units)
+    chosen[..., :size] = numbers
+    logit_bias = bias.new_full((logits,), _NO_WEIGHT)
+    logit_bias[:components] = bias[:components]
+    head = panels(kinds, lanes)
+    tensors = (
+        _recurrent(decoder, units, lanes),
+        decoder.gates_latent.weight.detach().contiguous(),
+        decoder.start_latent.weight.detach().contiguous(),
+        _logit_panels(weight[:components], units, logits, lanes),
+        logit_bias,
+        chosen,
+        bias[components:].contiguous(),
+        head,
+        padded(kind_bias, lanes),
+    )
+    struct = _DecoderStruct(
+        *(size, units, components, many, logits, head.shape[0] * head.shape[2]),
+        *(tensor.data_ptr() for tensor in tensors),
+        decoder.log_sigma_min,
+        decoder.log_sigma_max - decoder.log_sigma_min,
+    )
+    needed = library.library.trajectron_decode_workspace
+    needed.restype = ctypes.c_int64
+    return _Packed(struct, tensors, needed(ctypes.byref(struct)))
+
+
+def _recurrent(decoder: Decoder, units: int, lanes: int) -> Tensor:
+    """[y; h] -> gates as [units / lanes, units + 2, 4 lanes]: inputs in the order h, y."""
+    given = decoder.recurrent.weight.detach()  # [4 size, 2 + size]
+    gates = given.new_zeros(PANEL_VECTORS, units, units + 2)
+    own = given.reshape(PANEL_VECTORS, decoder.size, -1)
+    gates[:, : decoder.size, : decoder.size] = own[..., 2:]
+    gates[:, : decoder.size, units:] = own[..., :2]
+    by_panel = gates.reshape(PANEL_VECTORS, -1, lanes, units + 2)
+    return by_panel.permute(1, 3, 0, 2).contiguous()
+
+
+def _logit_panels(weight: Tensor, units: int, logits: int, lanes: int) -> Tensor:
+    """Weights of logits [M, size] as [logits / (2 lanes), units, 2 lanes]."""
+    full = weight.new_zeros(logits, units)
+    full[: weight.shape[0], : weight.shape[1]] = weight
+    return full.reshape(-1, _LOGIT_VECTORS * lanes, units).transpose(1, 2).contiguous()
+
+
+def _by_kind(weight: Tensor, bias: Tensor, units: int, many: int) -> tuple[Tensor, Tensor]:
+    """The head's rows as six kinds of ``many`` each: [6 many, units] and [6 many]."""
+    components = weight.shape[0] // 6
+    kinds, kind_bias = weight.new_zeros(6, many, units), bias.new_zeros(6, many)
+    kinds[0, :components, : weight.shape[1]] = weight[:components]
+    kind_bias[0] = _NO_WEIGHT
+    kind_bias[0, :components] = bias[:components]
+    rest = weight[components:].reshape(components, 5, -1)
+    kinds[1:, :components, : weight.shape[1]] = rest.transpose(0, 1)
+    kind_bias[1:, :components] = bias[components:].reshape(components, 5).T
+    return kinds.reshape(6 * many, units), kind_bias.reshape(6 * many)
+
+
+def _up(number: int, step: int) -> int:
+    """The next multiple of ``step``."""
+    return -(-number // step) * step
+
+
+_PACKED = PackedWeights(_pack)
