@@ -144,8 +144,7 @@ def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torc
 def table(rows: list[Row]) -> str:
     """The figures as Markdown."""
     lines = [
-        "| forecast | agents | ours ms | bare products ms | torch ms | ours / bare "
-        "| torch / ours |",
+        "| forecast | agents | ours ms | bare products ms | torch ms | ours / bare | torch / ours |",
         "| --- " * 7 + "|",
     ]
     for row in rows:

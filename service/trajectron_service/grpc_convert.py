@@ -135,6 +135,7 @@ def stream_options(message: pb.StreamOpen) -> core.StreamOptions:
         forecast=forecast_options(message.options) if every else None,
         delivery=_known(_DELIVERIES, message.delivery, "delivery", "a StreamDelivery"),
         close_session_at_end=message.close_session_at_end,
+        must_exist=message.must_exist,
     )
 
 

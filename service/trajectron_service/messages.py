@@ -226,6 +226,7 @@ class StreamOptions:
     forecast: ForecastOptions | None
     delivery: Delivery = Delivery.ALL
     close_session_at_end: bool = False
+    must_exist: bool = False
 
 
 @dataclass(frozen=True, slots=True)

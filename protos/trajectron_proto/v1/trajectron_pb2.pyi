@@ -1154,6 +1154,7 @@ class StreamOpen(_message.Message):
     FORECAST_EVERY_FRAME_FIELD_NUMBER: _builtins.int
     DELIVERY_FIELD_NUMBER: _builtins.int
     CLOSE_SESSION_AT_END_FIELD_NUMBER: _builtins.int
+    MUST_EXIST_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """An open session to go on with, or the id of a new one; assigned when empty."""
     forecast_every_frame: _builtins.bool
@@ -1161,6 +1162,10 @@ class StreamOpen(_message.Message):
     delivery: Global___StreamDelivery.ValueType
     close_session_at_end: _builtins.bool
     """Closes the session when the stream ends in good order; default false."""
+    must_exist: _builtins.bool
+    """The session has to exist: NOT_FOUND, with what became of it, instead of a new one.
+    Set by a client that goes on after a break.
+    """
     @_builtins.property
     def config(self) -> Global___SessionConfig:
         """For a new session; ignored when the session exists."""
@@ -1178,10 +1183,11 @@ class StreamOpen(_message.Message):
         forecast_every_frame: _builtins.bool | None = ...,
         delivery: Global___StreamDelivery.ValueType = ...,
         close_session_at_end: _builtins.bool = ...,
+        must_exist: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "config", b"config", "forecast_every_frame", b"forecast_every_frame", "options", b"options"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "close_session_at_end", b"close_session_at_end", "config", b"config", "delivery", b"delivery", "forecast_every_frame", b"forecast_every_frame", "options", b"options", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame", "close_session_at_end", b"close_session_at_end", "config", b"config", "delivery", b"delivery", "forecast_every_frame", b"forecast_every_frame", "must_exist", b"must_exist", "options", b"options", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__forecast_every_frame: _TypeAlias = _typing.Literal["forecast_every_frame"]  # noqa: Y015
     _WhichOneofArgType__forecast_every_frame: _TypeAlias = _typing.Literal["_forecast_every_frame", b"_forecast_every_frame"]  # noqa: Y015
