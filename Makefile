@@ -23,7 +23,7 @@ $(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard $(KERNELS
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt hatchling editables \
 		$$($(BIN)/python $(KERNELS)/build.py --requirement)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--no-build-isolation --editable '.[service,train,dev]'
+		--no-build-isolation --editable '.[service,train,tracing,dev]'
 	touch $@
 
 install: $(INSTALLED) ## create .venv and install everything at exact versions

@@ -96,6 +96,7 @@ class Sessions:
         metrics: told about sessions, agents and edges.
         max_sessions: more are refused.
         park_after_s: unused for longer, a session is kept as bytes only.
+        on_close: told which session has been closed for good.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class Sessions:
         metrics: Metrics,
         max_sessions: int,
         park_after_s: float,
+        on_close: Callable[[SessionKey], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._pack = pack
@@ -114,6 +116,7 @@ class Sessions:
         self._metrics = metrics
         self._quota = Quota(max_sessions)
         self._park_after_s = park_after_s
+        self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
         self._locks: weakref.WeakValueDictionary[SessionKey, asyncio.Lock] = (
             weakref.WeakValueDictionary()
@@ -491,6 +494,7 @@ class Sessions:
             if live is not None:
                 self._close(live)
         self._metrics.evictions.labels(closure.reason).inc()
+        self._on_close(key)
         await self._count()
         return True
 
