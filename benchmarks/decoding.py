@@ -3,8 +3,8 @@
 The floor of ``full`` is the recurrent and head products of the shipped decoder, rows = agents x
 samples, the terms of z and h_enc taken out of the loop, by torch; that of ``gmm`` the same with
 rows = agents x latent values. In float32, or in bfloat16 where a trial finds that quicker (a
-processor without it takes minutes for them). Forecasts are whole: from states to arrays, noise included. Every figure is
-measured in turn with its floor; ratios are taken pair by pair.
+processor without it takes minutes for them). Forecasts are whole: from states to arrays, noise
+included. Every figure is measured in turn with its floor; ratios are taken pair by pair.
 
     python -m benchmarks.decoding [--threads 2] [--repeats 9] [--check] [--json FILE]
 
@@ -18,8 +18,7 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -30,7 +29,6 @@ from benchmarks.runtime import about
 from trajectron_model import kernels, registry
 from trajectron_model.decoder import Decoder
 from trajectron_model.forecast import ForecastRequest
-from trajectron_model.kernels import decoding, dense
 from trajectron_model.trajectron import Trajectron
 
 FULL_AGENTS = (1, 5, 20, 40, 200, 1000)
@@ -79,18 +77,6 @@ def products(decoder: Decoder, rows: int, dtype: torch.dtype) -> Callable[[], No
     return run
 
 
-@contextmanager
-def by_torch() -> Iterator[None]:
-    """Torch does what kernels would."""
-    kept = decoding.library_for, dense.library_for
-    for module in (decoding, dense):
-        module.library_for = lambda *_: None
-    try:
-        yield
-    finally:
-        decoding.library_for, dense.library_for = kept
-
-
 def seconds(call: Callable[[], object]) -> float:
     """How long one call takes."""
     begun = time.perf_counter()
@@ -117,7 +103,7 @@ def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torc
         return model.forecast([state], [request])
 
     def torch_alone() -> object:
-        with by_torch():
+        with kernels.without():
             return model.forecast([state], [request])
 
     calls = [ours, products(decoder, rows, floor)]
@@ -144,7 +130,7 @@ def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torc
 def table(rows: list[Row]) -> str:
     """The figures as Markdown."""
     lines = [
-        "| forecast | agents | ours ms | bare products ms | torch ms | ours / bare | torch / ours |",
+        "| forecast | agents | ours ms | bare ms | torch ms | ours / bare | torch / ours |",
         "| --- " * 7 + "|",
     ]
     for row in rows:

@@ -12,8 +12,15 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
+from benchmarks import tracing as benchmark
 from trajectron_service import lifecycle, telemetry
 from trajectron_service.settings import Settings, SettingsError
+
+
+async def test_the_benchmark_gives_the_cost_of_hooks_beside_a_calls() -> None:
+    off_s, ratio, hooks_s = await benchmark.measure(rounds=1, calls=5)
+    assert 0.0 < hooks_s < off_s
+    assert ratio > 0.0
 
 
 def test_tracing_without_its_packages_is_refused_with_what_to_install(

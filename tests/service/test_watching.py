@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tests.service.building import (
     DT_S,
     Clock,
+    Loaded,
     application,
     config,
     observation,
@@ -18,6 +19,7 @@ from tests.service.building import (
     walk,
 )
 
+from benchmarks import watching as benchmark
 from trajectron_model import registry
 from trajectron_model.data.eth_ucy import EthUcy
 from trajectron_model.data.recording import Recording
@@ -364,6 +366,39 @@ async def test_a_forecast_that_cannot_be_drawn_fails_nobody(
     assert outcomes(app) == {"failed": 3}
     assert watching(app).pending_agents == 0
     await app.close()
+
+
+async def test_a_forecast_given_up_while_it_is_drawn_is_counted_once(network: Trajectron) -> None:
+    app = application(network, live_accuracy_pending=3, **ALL)
+    watched_by = watching(app)
+    await app.create_session("s", SessionConfig())
+    for one in walk(range(3)):
+        await app.observe("s", (one,), None)
+    run_alone, count = watched_by._run_alone, 0
+
+    async def gives_up_and_fails(call: Any) -> None:
+        nonlocal count
+        count += 1
+        if count > 1:
+            return await run_alone(call)
+        await app.predict_session("s", ASK, None)
+        raise RuntimeError("no memory")
+
+    watched_by._run_alone = gives_up_and_fails
+    await app.predict_session("s", ASK, None)
+    await watched_by.settled()
+    assert outcomes(app) == {"evicted": 3}
+    assert watched_by.pending_agents == 3
+    await app.close()
+
+
+async def test_the_benchmark_scores_a_share_and_says_what_it_cost(network: Trajectron) -> None:
+    engine = Engine([Loaded(network)])
+    result = await benchmark.compare(
+        engine, ForecastMode.FULL, agents=2, rounds=1, frames=15, budget=0.5
+    )
+    assert 0.0 < result.scored < 1.0
+    assert 0.0 < result.share < 1.0
 
 
 def pending(horizon: int = 3) -> Pending:

@@ -299,8 +299,10 @@ class LiveAccuracy:
         except Exception:
             # Watching is no reason to fail anybody; the metric and the log tell.
             log.exception("a forecast could not be watched", model=pending.model, part=work.kind)
-            self._forget(pending)
-            self._drop(pending, failed=len(pending.ids))
+            # It may have been given up for its age while it was being drawn.
+            if not pending.dropped:
+                self._forget(pending)
+                self._drop(pending, failed=len(pending.ids))
         else:
             self._budget.note(work.kind, len(pending.ids), took.seconds)
             if work.kind == "score":
