@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import nn
+from torch import Tensor
 
 from trajectron_model import graph
 from trajectron_model.config import ModelConfig
@@ -33,14 +33,15 @@ def step(
     """
     if not scenes:
         return []
-    library = library_for(model) if model.config.features == "heading" else None
+    first = model.node_model(0).history.node.weight_ih
+    library = library_for(first) if model.config.features == "heading" else None
     if library is None:
         layout = Layout.of(model.config)
         stepped = model.step([state_of(model, scene) for scene in scenes], frames)
         return [pack(state, layout) for state in stepped]
-    weights = _WEIGHTS.of(model, library)
+    packed = _WEIGHTS.of(model, library)
     admitted = [
-        _admit(scene, frame, model.config, weights.layout)
+        _admit(scene, frame, model.config, packed.layout)
         for scene, frame in zip(scenes, frames, strict=True)
     ]
     rows = stepping.SceneRows(
@@ -49,9 +50,9 @@ def step(
         observed=[observed for _, observed in admitted],
         positions=[frame.positions for frame in frames],
         times_s=[frame.time_s for frame in frames],
-        layout=weights.layout,
+        layout=packed.layout,
     )
-    after = stepping.step(library, weights, rows)
+    after = stepping.step(library, packed, rows)
     return [
         PackedScene(scene.ids, nodes, edges, frame.time_s)
         for (scene, _), frame, (nodes, edges) in zip(admitted, frames, after, strict=True)
@@ -93,10 +94,18 @@ def _admit(
     return scene, [row_of[name] for name in frame.ids]
 
 
-def _weights(module: nn.Module, _library: Kernels) -> stepping.StepWeights:
-    assert isinstance(module, Trajectron)
-    encoders = [module.node_model(kind).history for kind in range(len(module.nodes))]
-    return stepping.pack_weights(module.config, encoders, graph.radius_table(module.config))
+def _encoder_weights(model: Trajectron) -> tuple[Tensor, ...]:
+    cells = [
+        cell
+        for kind in range(len(model.nodes))
+        for cell in (model.node_model(kind).history.node, *model.node_model(kind).history.edges)
+    ]
+    return tuple(w for c in cells for w in (c.weight_ih, c.weight_hh, c.bias_ih, c.bias_hh))
 
 
-_WEIGHTS = PackedWeights(_weights)
+def _pack_weights(model: Trajectron, _library: Kernels) -> stepping.StepWeights:
+    encoders = [model.node_model(kind).history for kind in range(len(model.nodes))]
+    return stepping.pack_weights(model.config, encoders, graph.radius_table(model.config))
+
+
+_WEIGHTS = PackedWeights(_encoder_weights, _pack_weights)

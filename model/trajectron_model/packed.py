@@ -58,40 +58,48 @@ class Layout:
         """The layout of a model's scenes."""
         return cls(len(config.types), config.history_size, config.edge_size)
 
-    @functools.cached_property
+    @property
     def node(self) -> np.dtype[np.void]:
         """One agent; ``step.c`` has the same, in the same order."""
-        edges = (self.kinds, self.edge_size)
-        return np.dtype(
-            [
-                ("position", "<f8", 2),
-                ("last_seen_s", "<f8"),
-                ("type", "<i4"),
-                ("observations", "<i4"),
-                ("heading_known", "<i4"),
-                ("unused", "<i4"),
-                ("velocity", "<f4", 2),
-                ("acceleration", "<f4", 2),
-                ("smoothed", "<f4", 2),
-                ("heading", "<f4", 2),
-                ("turn", "<f4", 2),
-                ("influence", "<f4", self.kinds),
-                ("node_h", "<f4", self.history_size),
-                ("node_c", "<f4", self.history_size),
-                ("edge_h", "<f4", edges),
-                ("edge_c", "<f4", edges),
-                # Keeps doubles where they belong in the next record.
-                *([("fill", "<f4")] if self.kinds % 2 else []),
-            ]
-        )
+        return _node(self.kinds, self.history_size, self.edge_size)
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - layouts are few and live as long as models
     def blank(self, kind: int) -> bytes:
         """The record of an agent that has not been seen yet."""
-        record = np.zeros(1, dtype=self.node)
-        record["type"] = kind
-        record["heading"][:, 0] = record["turn"][:, 0] = 1.0
-        return record.tobytes()
+        return _blank(self, kind)
+
+
+@functools.cache
+def _node(kinds: int, history_size: int, edge_size: int) -> np.dtype[np.void]:
+    return np.dtype(
+        [
+            ("position", "<f8", 2),
+            ("last_seen_s", "<f8"),
+            ("type", "<i4"),
+            ("observations", "<i4"),
+            ("heading_known", "<i4"),
+            ("unused", "<i4"),
+            ("velocity", "<f4", 2),
+            ("acceleration", "<f4", 2),
+            ("smoothed", "<f4", 2),
+            ("heading", "<f4", 2),
+            ("turn", "<f4", 2),
+            ("influence", "<f4", (kinds,)),
+            ("node_h", "<f4", history_size),
+            ("node_c", "<f4", history_size),
+            ("edge_h", "<f4", (kinds, edge_size)),
+            ("edge_c", "<f4", (kinds, edge_size)),
+            # Keeps doubles where they belong in the next record.
+            *([("fill", "<f4")] if kinds % 2 else []),
+        ]
+    )
+
+
+@functools.cache
+def _blank(layout: Layout, kind: int) -> bytes:
+    record = np.zeros(1, dtype=layout.node)
+    record["type"] = kind
+    record["heading"][:, 0] = record["turn"][:, 0] = 1.0
+    return record.tobytes()
 
 
 class PackedScene(NamedTuple):
