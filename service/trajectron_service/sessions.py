@@ -72,7 +72,8 @@ class Change(NamedTuple):
 class _Live:
     """A session in use. ``record`` is None until it is read from the store.
 
-    ``revision`` is the store's, as far as known here; ``stored_expiry`` is when it closes there.
+    ``revision`` is the store's, as far as known here; ``stored_expiry`` is when it closes there;
+    ``idle_timeout_s`` is known once a record was.
     """
 
     key: SessionKey
@@ -80,6 +81,7 @@ class _Live:
     record: SceneRecord | None = None
     revision: str = ""
     stored_expiry: float = 0.0
+    idle_timeout_s: float = 0.0
     users: int = 0
     holds: int = 0
     closed: bool = False
@@ -266,12 +268,17 @@ class Sessions:
         """Keeps the sessions open that are held."""
         now = self._clock()
         for live in [live for live in self._live.values() if live.holds]:
-            idle_s = live.record.idle_timeout_s if live.record else 0.0
-            # Read first where it is parked; a busy one is kept open by what it does.
-            if live.users or (live.record and live.stored_expiry > now + max(idle_s / 2, _HELD_S)):
+            idle_s = live.idle_timeout_s
+            # A busy one is kept open by what it does.
+            if live.users or live.stored_expiry > now + max(idle_s / 2, _HELD_S):
                 continue
-            with suppress(ServiceError):  # gone: whoever holds it is told when it is used
-                await self.change(live.key, _looked_at)
+            if not idle_s:
+                with suppress(ServiceError):  # gone: whoever holds it is told when it is used
+                    await self.change(live.key, _looked_at)
+                continue
+            live.expires_at = now + idle_s
+            if not await self._touch(live, live.expires_at, self._slack_s(idle_s)):
+                self._close(live)
 
     async def reap(self) -> int:
         """Closes the sessions that have expired; how many. One in use is left alone."""
@@ -400,7 +407,7 @@ class Sessions:
             if not await self._write(live, after, packed, expires_at):
                 self._show(live, None)
                 return False
-        elif not await self._touch(live, expires_at, self._slack_s(after)):
+        elif not await self._touch(live, expires_at, self._slack_s(after.idle_timeout_s)):
             self._close(live)
         if live.closed:
             raise await self._gone(live.key)
@@ -431,11 +438,13 @@ class Sessions:
 
     def _stored(self, record: SceneRecord, packed: bytes, expires_at: float) -> StoredSession:
         data = records.encode(record, packed)
-        return StoredSession(new_revision(), expires_at + self._slack_s(record), data)
+        return StoredSession(
+            new_revision(), expires_at + self._slack_s(record.idle_timeout_s), data
+        )
 
-    def _slack_s(self, record: SceneRecord) -> float:
+    def _slack_s(self, idle_timeout_s: float) -> float:
         """How much later than it must the store may close a session, so that it is told less."""
-        return min(_LONGEST_SLACK_S, record.idle_timeout_s / 20) if self._store.durable else 0.0
+        return min(_LONGEST_SLACK_S, idle_timeout_s / 20) if self._store.durable else 0.0
 
     async def _park(self, live: _Live) -> bool:
         if live.users or live.closed:
@@ -508,6 +517,8 @@ class Sessions:
         self._metrics.agents.inc(agents)
         self._metrics.edges.inc(edges)
         live.record = record
+        if record is not None:
+            live.idle_timeout_s = record.idle_timeout_s
 
     async def _count(self) -> None:
         self._metrics.sessions.set(await self._store.count())
