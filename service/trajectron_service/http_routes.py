@@ -47,6 +47,7 @@ def http_app(
         version: of the distribution, for the OpenAPI page.
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
+    app.state.metrics = metrics
     app.add_middleware(RequestMiddleware, metrics=metrics)
     app.add_exception_handler(ServiceError, http_errors.on_service_error)
     app.add_exception_handler(HTTPException, http_errors.on_http_exception)

@@ -94,6 +94,7 @@ class Sessions:
         metrics: told about sessions, agents and edges.
         max_sessions: more are refused.
         park_after_s: unused for longer, a session is kept as bytes only.
+        on_close: told which session has been closed for good.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class Sessions:
         metrics: Metrics,
         max_sessions: int,
         park_after_s: float,
+        on_close: Callable[[SessionKey], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._pack = pack
@@ -113,6 +115,7 @@ class Sessions:
         self._kept = KeptRecords(store, clock, metrics)
         self._quota = Quota(max_sessions)
         self._park_after_s = park_after_s
+        self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
         self._locks: weakref.WeakValueDictionary[SessionKey, asyncio.Lock] = (
             weakref.WeakValueDictionary()
@@ -452,6 +455,7 @@ class Sessions:
             if live is not None:
                 self._close(live)
         self._metrics.evictions.labels(closure.reason).inc()
+        self._on_close(key)
         await self._kept.count()
         return True
 
