@@ -35,7 +35,7 @@ from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
 from trajectron_service.session_errors import STREAM_ENDED
 from trajectron_service.sessions import Change, Sessions
 from trajectron_service.settings import Settings
-from trajectron_service.stores import SessionKey, SessionStore
+from trajectron_service.stores import SessionKey, SessionStore, StoreError
 from trajectron_service.stores.memory import MemoryStore
 from trajectron_service.streams import Stream, StreamLimits
 from trajectron_service.timebase import Timeline
@@ -417,16 +417,22 @@ class Application:
         for waited_s in report.waited_s:
             self._metrics.stage_seconds.labels("queue").observe(waited_s)
 
+    async def keep_house(self) -> None:
+        """Keeps sessions open that streams hold, closes those expired, parks those unused."""
+        await self._sessions.renew()
+        await self._sessions.reap()
+        await self._sessions.park()
+
     async def _keep_house(self) -> None:
         """Closes sessions that have expired and parks those unused, until cancelled."""
         while True:
             await asyncio.sleep(HOUSEKEEPING_S)
             try:
-                await self._sessions.renew()
-                await self._sessions.reap()
-                await self._sessions.park()
-            except Exception:
+                await self.keep_house()
+            except (ServiceError, StoreError) as error:
                 # A full queue or a store that is away: the next round tries again.
+                log.warning("housekeeping put off", reason=str(error))
+            except Exception:
                 log.exception("housekeeping failed")
 
 
