@@ -69,8 +69,12 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_send_message_length", settings.max_reply_bytes),
         ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
         ("grpc.keepalive_timeout_ms", _KEEPALIVE_TIMEOUT_MS),
+        # A keepalive is a ping, and waits for so long; a minute unless said.
+        ("grpc.http2.ping_timeout_ms", _KEEPALIVE_TIMEOUT_MS),
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.min_ping_interval_without_data_ms", _SHORTEST_PING_MS),
+        # While such a probe is on its way no keepalive is sent, and a dead peer is never noticed.
+        ("grpc.http2.bdp_probe", 0),
         # Otherwise a second server would share the port, and half of the calls, unnoticed.
         ("grpc.so_reuseport", 0),
     ]

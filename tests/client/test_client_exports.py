@@ -54,6 +54,7 @@ EXPORTED = [
     "SessionDamagedError",
     "SessionExistsError",
     "SessionInfo",
+    "SessionLostError",
     "SessionOptions",
     "SessionSnapshot",
     "StoreUnavailableError",

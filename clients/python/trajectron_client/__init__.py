@@ -15,6 +15,7 @@ Positions are metres in your own world-fixed frame, times seconds on your own cl
 """
 
 from trajectron_client.async_calls import AsyncSession
+from trajectron_client.async_streams import AsyncStream
 from trajectron_client.evaluations import (
     Evaluation,
     EvaluationOptions,
@@ -42,6 +43,7 @@ from trajectron_client.exceptions import (
     ServiceError,
     SessionDamagedError,
     SessionExistsError,
+    SessionLostError,
     StoreUnavailableError,
     TooLargeError,
     TooManyEvaluationsError,
@@ -79,7 +81,7 @@ from trajectron_client.scene import (
     StreamFrame,
     UnknownTypes,
 )
-from trajectron_client.streams import AsyncStream, Stream
+from trajectron_client.streams import Stream
 from trajectron_client.sync_calls import Session
 
 __all__ = [
@@ -129,6 +131,7 @@ __all__ = [
     "SessionDamagedError",
     "SessionExistsError",
     "SessionInfo",
+    "SessionLostError",
     "SessionOptions",
     "SessionSnapshot",
     "StoreUnavailableError",

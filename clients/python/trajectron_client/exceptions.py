@@ -2,6 +2,7 @@
 
 TrajectronError
 ├── TransportError                  no answer of the service: refused, broken off, not understood
+├── SessionLostError                the service has lost frames that it had acknowledged
 └── ServiceError                    the service answered with an error
     ├── InvalidArgumentError        a field of the request is at fault; see ``violations``
     │   └── MalformedError          the request could not be read at all
@@ -50,6 +51,10 @@ class TrajectronError(Exception):
 
 class TransportError(TrajectronError):
     """No answer of the service: the connection was refused or broken, or the answer unreadable."""
+
+
+class SessionLostError(TrajectronError):
+    """A stream cannot go on: the service has lost frames of its session that it acknowledged."""
 
 
 class ServiceError(TrajectronError):

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import secrets
+import time
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
 
 import grpc
-from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2
 
-from trajectron_client import evaluation_operations, evaluations, operations, protobuf
+from trajectron_client import evaluations, operations, protobuf
 from trajectron_client.async_calls import AsyncCalls
+from trajectron_client.async_streams import AsyncCall, AsyncStream
+from trajectron_client.connections import Connections, Route, elsewhere
 from trajectron_client.evaluations import Evaluation
-from trajectron_client.exceptions import DeadlineExceededError, TransportError
+from trajectron_client.exceptions import DeadlineExceededError, TrajectronError, TransportError
 from trajectron_client.grpc_errors import translated
 from trajectron_client.operations import Operation
 from trajectron_client.scene import (
@@ -24,41 +28,14 @@ from trajectron_client.scene import (
     SessionOptions,
     StreamFrame,
 )
-from trajectron_client.streams import AsyncCall, AsyncStream, Stream, SyncCall
+from trajectron_client.streams import Stream, SyncCall
 from trajectron_client.sync_calls import SyncCalls
-from trajectron_proto.v1 import evaluation_pb2, evaluation_pb2_grpc, trajectron_pb2_grpc
+from trajectron_proto.v1 import evaluation_pb2
 from trajectron_proto.v1 import trajectron_pb2 as pb
 
 T = TypeVar("T")
 Metadata = Sequence[tuple[str, str | bytes]]
 
-# 200 samples x 12 steps of 2000 agents are 38 MB.
-_MAX_ANSWER_BYTES = 64 * 1024 * 1024
-# Calls that change nothing, so that sending one twice does no harm.
-_SAFE_TO_REPEAT = {
-    operations.SERVICE: (
-        "Predict", "PredictSession", "GetSession", "ListSessions", "ListModels",
-    ),
-    evaluation_operations.SERVICE: ("GetEvaluation", "ListEvaluations", "GetEvaluationResult"),
-}  # fmt: skip
-_SERVICE_CONFIG = {
-    "methodConfig": [
-        {
-            "name": [
-                {"service": service, "method": method}
-                for service, methods in _SAFE_TO_REPEAT.items()
-                for method in methods
-            ],
-            "retryPolicy": {
-                "maxAttempts": 4,
-                "initialBackoff": "0.05s",
-                "maxBackoff": "1s",
-                "backoffMultiplier": 2,
-                "retryableStatusCodes": ["UNAVAILABLE"],
-            },
-        }
-    ]
-}
 _SERVING = health_pb2.HealthCheckResponse.SERVING
 
 
@@ -69,37 +46,41 @@ class Client(SyncCalls):
     cannot be reached.
 
     Args:
-        target: ``host:port`` of the service.
+        target: ``host:port`` of the service, or of each of its replicas: one is used until it
+            fails or stops, then the next.
         timeout_s: for calls that bring none of their own; None for as long as it takes.
         credentials: for TLS; plain text when None.
         metadata: sent with every call.
+        reconnect_for_s: how long a stream tries to go on after its connection broke; 0 for not at
+            all.
         options: further gRPC channel options.
     """
 
     def __init__(
         self,
-        target: str = "127.0.0.1:50051",
+        target: str | Sequence[str] = "127.0.0.1:50051",
         *,
         timeout_s: float | None = 10.0,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Metadata = (),
+        reconnect_for_s: float = 60.0,
         options: Sequence[tuple[str, Any]] = (),
     ) -> None:
         self._timeout_s = timeout_s
         self._metadata = tuple(metadata)
-        merged = _channel_options(options)
-        self._channel = (
-            grpc.insecure_channel(target, merged)
-            if credentials is None
-            else grpc.secure_channel(target, credentials, merged)
-        )
-        self._stub = trajectron_pb2_grpc.TrajectronServiceStub(self._channel)
-        self._evaluations = evaluation_pb2_grpc.EvaluationServiceStub(self._channel)
-        self._health: Any = health_pb2_grpc.HealthStub(self._channel)
+        self._reconnect_for_s = reconnect_for_s
+
+        def connect(address: str, merged: list[tuple[str, Any]]) -> grpc.Channel:
+            if credentials is None:
+                return grpc.insecure_channel(address, merged)
+            return grpc.secure_channel(address, credentials, merged)
+
+        self._connections = Connections(_addresses(target), connect, options)
 
     def close(self) -> None:
         """Closes the connection; calls under way are cancelled."""
-        self._channel.close()
+        for connection in self._connections:
+            connection.channel.close()
 
     def __enter__(self) -> Self:
         return self
@@ -114,20 +95,20 @@ class Client(SyncCalls):
 
     def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether the service takes work now; False as well when it cannot be reached."""
-        try:
-            with translated():
-                reply = self._health.Check(
+        for connection in self._connections:
+            with suppress(TransportError, DeadlineExceededError), translated():
+                reply = connection.health.Check(
                     health_pb2.HealthCheckRequest(),
                     timeout=_first(timeout_s, self._timeout_s),
                     metadata=self._metadata,
                 )
-        except (TransportError, DeadlineExceededError):
-            return False
-        return bool(reply.status == _SERVING)
+                if reply.status == _SERVING:
+                    return True
+        return False
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Returns once the service takes work; raises ``DeadlineExceededError`` otherwise."""
-        watch = self._health.Watch(
+        watch = self._connections.current.health.Watch(
             health_pb2.HealthCheckRequest(),
             timeout=timeout_s,
             metadata=self._metadata,
@@ -159,8 +140,8 @@ class Client(SyncCalls):
 
         Args:
             frames: frames in order of time, or ``StreamFrame`` to number them yourself.
-            session_id: a session to go on with, or the name of a new one; named by the server
-                when None.
+            session_id: a session to go on with, or the name of a new one; a random name when
+                None.
             config: for a new session.
             forecast_every_frame: False for results only, but for frames with options of their own.
             delivery: ``"latest"`` leaves out forecasts that newer frames have superseded before
@@ -173,23 +154,29 @@ class Client(SyncCalls):
             ServiceError: the stream was refused; later faults of the stream are raised by
                 iterating, faults of one frame stand in its reply.
             TransportError: the service could not be reached; iterating raises it when the
-                connection breaks.
+                connection broke and the stream could not go on within ``reconnect_for_s``.
+            SessionLostError: by iterating, when the service has lost frames that it acknowledged.
         """
         opening = _opening(
             session_id, config, options, forecast_every_frame, delivery, close_session_at_end
         )
+        route = Route(self._connections, self._reconnect_for_s)
+        until = None if timeout_s is None else time.monotonic() + timeout_s
 
         def start(requests: Iterator[pb.StreamPredictRequest]) -> SyncCall:
-            return self._stub.StreamPredict(requests, timeout=timeout_s, metadata=self._metadata)
+            left_s = None if until is None else max(0.0, until - time.monotonic())
+            stub = route.next().service
+            call: SyncCall = stub.StreamPredict(requests, timeout=left_s, metadata=self._metadata)
+            return call
 
-        return Stream(start, opening, frames)
+        return Stream(start, opening, frames, route.reopening)
 
     def watch_evaluation(
         self, evaluation_id: str, *, timeout_s: float | None = None
     ) -> Iterator[Evaluation]:
         """See ``SyncEvaluations``."""
         request = evaluation_pb2.WatchEvaluationRequest(evaluation_id=evaluation_id)
-        call = self._evaluations.WatchEvaluation(
+        call = self._connections.current.evaluations.WatchEvaluation(
             request, timeout=timeout_s, metadata=self._metadata
         )
         try:
@@ -201,13 +188,21 @@ class Client(SyncCalls):
 
     def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
         ours = operation.service == operations.SERVICE
-        call = getattr(self._stub if ours else self._evaluations, operation.rpc)
         request = operation.message()
-        with translated():
-            reply = call(
-                request, timeout=_first(timeout_s, self._timeout_s), metadata=self._metadata
-            )
-        return operation.from_message(reply)
+        for left in reversed(range(len(self._connections))):
+            connection = self._connections.current
+            call = getattr(connection.service if ours else connection.evaluations, operation.rpc)
+            try:
+                with translated():
+                    reply = call(
+                        request, timeout=_first(timeout_s, self._timeout_s), metadata=self._metadata
+                    )
+                return operation.from_message(reply)
+            except TrajectronError as error:
+                if not left or not elsewhere(operation, error):
+                    raise
+                self._connections.turn(connection)
+        raise AssertionError("unreachable: the last attempt returns or raises")
 
 
 class AsyncClient(AsyncCalls):
@@ -217,10 +212,13 @@ class AsyncClient(AsyncCalls):
     cannot be reached.
 
     Args:
-        target: ``host:port`` of the service.
+        target: ``host:port`` of the service, or of each of its replicas: one is used until it
+            fails or stops, then the next.
         timeout_s: for calls that bring none of their own; None for as long as it takes.
         credentials: for TLS; plain text when None.
         metadata: sent with every call.
+        reconnect_for_s: how long a stream tries to go on after its connection broke; 0 for not at
+            all.
         options: further gRPC channel options.
 
     Raises:
@@ -229,29 +227,30 @@ class AsyncClient(AsyncCalls):
 
     def __init__(
         self,
-        target: str = "127.0.0.1:50051",
+        target: str | Sequence[str] = "127.0.0.1:50051",
         *,
         timeout_s: float | None = 10.0,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Metadata = (),
+        reconnect_for_s: float = 60.0,
         options: Sequence[tuple[str, Any]] = (),
     ) -> None:
         asyncio.get_running_loop()  # gRPC binds a channel to a loop when it is made
         self._timeout_s = timeout_s
         self._metadata = tuple(metadata)
-        merged = _channel_options(options)
-        self._channel = (
-            grpc.aio.insecure_channel(target, merged)
-            if credentials is None
-            else grpc.aio.secure_channel(target, credentials, merged)
-        )
-        self._stub = trajectron_pb2_grpc.TrajectronServiceStub(self._channel)
-        self._evaluations = evaluation_pb2_grpc.EvaluationServiceStub(self._channel)
-        self._health: Any = health_pb2_grpc.HealthStub(self._channel)
+        self._reconnect_for_s = reconnect_for_s
+
+        def connect(address: str, merged: list[tuple[str, Any]]) -> grpc.aio.Channel:
+            if credentials is None:
+                return grpc.aio.insecure_channel(address, merged)
+            return grpc.aio.secure_channel(address, credentials, merged)
+
+        self._connections = Connections(_addresses(target), connect, options)
 
     async def close(self) -> None:
         """Closes the connection; calls under way are cancelled."""
-        await self._channel.close()
+        for connection in self._connections:
+            await connection.channel.close()
 
     async def __aenter__(self) -> Self:
         return self
@@ -266,20 +265,20 @@ class AsyncClient(AsyncCalls):
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether the service takes work now; False as well when it cannot be reached."""
-        try:
-            with translated():
-                reply = await self._health.Check(
+        for connection in self._connections:
+            with suppress(TransportError, DeadlineExceededError), translated():
+                reply = await connection.health.Check(
                     health_pb2.HealthCheckRequest(),
                     timeout=_first(timeout_s, self._timeout_s),
                     metadata=self._metadata,
                 )
-        except (TransportError, DeadlineExceededError):
-            return False
-        return bool(reply.status == _SERVING)
+                if reply.status == _SERVING:
+                    return True
+        return False
 
     async def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Returns once the service takes work; raises ``DeadlineExceededError`` otherwise."""
-        watch = self._health.Watch(
+        watch = self._connections.current.health.Watch(
             health_pb2.HealthCheckRequest(),
             timeout=timeout_s,
             metadata=self._metadata,
@@ -312,18 +311,23 @@ class AsyncClient(AsyncCalls):
         opening = _opening(
             session_id, config, options, forecast_every_frame, delivery, close_session_at_end
         )
+        route = Route(self._connections, self._reconnect_for_s)
+        until = None if timeout_s is None else time.monotonic() + timeout_s
 
         def start(requests: AsyncIterator[pb.StreamPredictRequest]) -> AsyncCall:
-            return self._stub.StreamPredict(requests, timeout=timeout_s, metadata=self._metadata)
+            left_s = None if until is None else max(0.0, until - time.monotonic())
+            stub = route.next().service
+            call: AsyncCall = stub.StreamPredict(requests, timeout=left_s, metadata=self._metadata)
+            return call
 
-        return AsyncStream(start, opening, frames)
+        return AsyncStream(start, opening, frames, route.reopening)
 
     async def watch_evaluation(
         self, evaluation_id: str, *, timeout_s: float | None = None
     ) -> AsyncIterator[Evaluation]:
         """See ``AsyncEvaluations``."""
         request = evaluation_pb2.WatchEvaluationRequest(evaluation_id=evaluation_id)
-        call: Any = self._evaluations.WatchEvaluation(
+        call: Any = self._connections.current.evaluations.WatchEvaluation(
             request, timeout=timeout_s, metadata=self._metadata
         )
         try:
@@ -335,21 +339,21 @@ class AsyncClient(AsyncCalls):
 
     async def _run(self, operation: Operation[T], timeout_s: float | None) -> T:
         ours = operation.service == operations.SERVICE
-        call = getattr(self._stub if ours else self._evaluations, operation.rpc)
         request = operation.message()
-        with translated():
-            reply = await call(
-                request, timeout=_first(timeout_s, self._timeout_s), metadata=self._metadata
-            )
-        return operation.from_message(reply)
-
-
-def _channel_options(given: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    ours = {
-        "grpc.max_receive_message_length": _MAX_ANSWER_BYTES,
-        "grpc.service_config": json.dumps(_SERVICE_CONFIG),
-    }
-    return list((ours | dict(given)).items())
+        for left in reversed(range(len(self._connections))):
+            connection = self._connections.current
+            call = getattr(connection.service if ours else connection.evaluations, operation.rpc)
+            try:
+                with translated():
+                    reply = await call(
+                        request, timeout=_first(timeout_s, self._timeout_s), metadata=self._metadata
+                    )
+                return operation.from_message(reply)
+            except TrajectronError as error:
+                if not left or not elsewhere(operation, error):
+                    raise
+                self._connections.turn(connection)
+        raise AssertionError("unreachable: the last attempt returns or raises")
 
 
 def _opening(
@@ -361,13 +365,18 @@ def _opening(
     close_session_at_end: bool,
 ) -> pb.StreamOpen:
     return pb.StreamOpen(
-        session_id=session_id or "",
+        # Named here, so that an opening whose answer is lost can be repeated.
+        session_id=session_id or secrets.token_hex(16),
         config=protobuf.session_config(**(config or {})),
         options=protobuf.forecast_options(**options),
         forecast_every_frame=forecast_every_frame,
         delivery=protobuf.delivery(delivery),
         close_session_at_end=close_session_at_end,
     )
+
+
+def _addresses(target: str | Sequence[str]) -> Sequence[str]:
+    return (target,) if isinstance(target, str) else target
 
 
 def _first(timeout_s: float | None, default_s: float | None) -> float | None:
