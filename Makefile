@@ -31,8 +31,8 @@ install: $(INSTALLED) ## create .venv and install everything at exact versions
 serve: $(INSTALLED) ## start the service on 127.0.0.1 (HTTP 8000, gRPC 50051); ARGS="--help" for flags
 	TRAJECTRON_STATE_DIR="$${TRAJECTRON_STATE_DIR-runs/service}" exec $(BIN)/trajectron serve $(ARGS)
 
-test: $(INSTALLED) ## run the tests; ARGS="-k name" for some
-	$(BIN)/python -m pytest $(ARGS)
+test: $(INSTALLED) ## run the tests, a process to each core; ARGS="-k name" for some
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
 
 check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentation links
 	$(BIN)/ruff format --check .
