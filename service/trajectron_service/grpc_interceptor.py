@@ -13,6 +13,8 @@ import grpc
 from google.protobuf.message import DecodeError
 
 from trajectron_service import logs
+from trajectron_service.access import scope_of_rpc
+from trajectron_service.admission import Admission
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.grpc_errors import abort
 from trajectron_service.metrics import Metrics
@@ -37,9 +39,11 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
     Args:
         services: their full names, such as ``trajectron.v1.TrajectronService``.
         metrics: where durations and stages go.
+        admission: who is let in.
     """
 
-    def __init__(self, services: Sequence[str], metrics: Metrics) -> None:
+    def __init__(self, services: Sequence[str], metrics: Metrics, admission: Admission) -> None:
+        self._admission = admission
         self._services = frozenset(services)
         self._metrics = metrics
 
@@ -72,6 +76,7 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         async def call(request: Any, context: Context) -> Any:
             with self._measured(method) as record:
                 try:
+                    self._admit(method, context)
                     return await behaviour(_checked(request), context)
                 except Exception as error:  # noqa: BLE001  every fault becomes a status
                     await abort(context, record.failed(error))
@@ -82,6 +87,7 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         async def call(request: Any, context: Context) -> AsyncIterator[Any]:
             with self._measured(method) as record:
                 try:
+                    self._admit(method, context)
                     # Closed here, not by the garbage collector: a cancelled stream frees its
                     # session at once.
                     async with aclosing(behaviour(checked(request), context)) as answers:
@@ -91,6 +97,11 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
                     await abort(context, record.failed(error))
 
         return call
+
+    def _admit(self, method: str, context: Context) -> None:
+        given = dict(context.invocation_metadata() or ()).get("authorization")
+        text = given.decode("latin-1") if isinstance(given, bytes) else given
+        self._admission.admit(text, scope_of_rpc(method))
 
     @contextmanager
     def _measured(self, method: str) -> Iterator[_Record]:

@@ -102,6 +102,22 @@ class Settings(BaseSettings):
     store_timeout_s: Seconds = Field(5.0, description="Time for one operation of the store.")
     drain_grace_s: Seconds = Field(20.0, description="Time for work in hand after SIGTERM.")
 
+    tls_certificate: Path | None = Field(
+        None, description="Certificate chain of both ports, PEM; plain text where unset."
+    )
+    tls_key: Path | None = Field(None, description="Its private key, PEM, unencrypted.")
+    tls_client_ca: Path | None = Field(
+        None, description="Authorities, PEM, one of which must have signed a client's certificate."
+    )
+    tokens: Path | None = Field(
+        None,
+        description="TOML file of tokens (`trajectron token new`); calls need one where it is set.",
+    )
+    insecure: bool = Field(
+        False,
+        description="Serve other machines without TLS, or without tokens or client certificates.",
+    )
+
     data: Path | None = Field(
         None,
         description="Folder of the ETH/UCY recordings with their `splits.json`, or its parent; "
