@@ -23,7 +23,7 @@ $(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard $(KERNELS
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt hatchling editables \
 		$$($(BIN)/python $(KERNELS)/build.py --requirement)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--no-build-isolation --editable '.[service,train,dev]'
+		--no-build-isolation --editable '.[service,train,tracing,dev]'
 	touch $@
 
 install: $(INSTALLED) ## create .venv and install everything at exact versions
@@ -31,8 +31,8 @@ install: $(INSTALLED) ## create .venv and install everything at exact versions
 serve: $(INSTALLED) ## start the service on 127.0.0.1 (HTTP 8000, gRPC 50051); ARGS="--help" for flags
 	TRAJECTRON_STATE_DIR="$${TRAJECTRON_STATE_DIR-runs/service}" exec $(BIN)/trajectron serve $(ARGS)
 
-test: $(INSTALLED) ## run the tests; ARGS="-k name" for some
-	$(BIN)/python -m pytest $(ARGS)
+test: $(INSTALLED) ## run the tests, a process to each core; ARGS="-k name" for some
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
 
 check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentation links
 	$(BIN)/ruff format --check .
@@ -52,6 +52,8 @@ protos: $(INSTALLED) ## generate the code of the contract and lint it
 bench: $(INSTALLED) ## time the model beside its bare matrix products, on one thread and on two
 	$(BIN)/python benchmarks/model.py --threads 1 --json benchmarks/results/model-1-thread.json
 	$(BIN)/python benchmarks/model.py --threads 2 --json benchmarks/results/model-2-threads.json
+	$(BIN)/python -m benchmarks.decoding --threads 1 --check --json benchmarks/results/decoding-1-thread.json
+	$(BIN)/python -m benchmarks.decoding --threads 2 --check --json benchmarks/results/decoding-2-threads.json
 
 crash: $(INSTALLED) ## kill the service 100 times under load and look for what is missing (half an hour)
 	$(BIN)/python -m benchmarks.crash --kills 100 --json benchmarks/results/crash.json $(ARGS)

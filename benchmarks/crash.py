@@ -4,7 +4,7 @@
 
 Sessions stream into a service that keeps them in SQLite. At random moments it gets SIGKILL and is
 started again; the clients go on by themselves. After each restart every session must have each
-acknowledged frame, once; in the end every forecast is compared with that of a service that
+acknowledged frame, once; in the end every forecast is compared with that of a session that
 was never interrupted. Half of the kills are done with every forecast alone in its batch, where
 it must be the same to the last bit; half with batches shared, where DESIGN.md's rule holds
 (parameters to 1e-4; at most one sample in 10,000 differs).
@@ -50,7 +50,7 @@ def crash(
             check_stored(replica.target, load.walks, acknowledged)
         load.moves_on()
         load.stop()
-        return compare(load.walks, replica.target, folder, model, dict(settings)), restarts
+        return compare(load.walks, replica.target), restarts
     finally:
         replica.end()
 

@@ -5,7 +5,7 @@
 Sessions stream to a list of two addresses. In turn a replica gets SIGKILL or SIGTERM at a random
 moment, the other one goes on with its sessions, and it is started again. After each move every
 session must have each acknowledged frame, once; in the end every forecast is compared with
-that of a service that was never interrupted, to the last bit: each is alone in its batch.
+that of a session that was never interrupted, to the last bit: each is alone in its batch.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ def handover(
     stood_s: dict[str, list[float]] = {"kill": [], "drain": []}
     try:
         for replica in replicas:
-            replica.start()
+            replica.launch()
+        for replica in replicas:
+            replica.ready()
         load.start()
         for turn, way in enumerate(ways):
             load.moves_on()
@@ -66,10 +68,10 @@ def handover(
             load.moves_on()
             stood_s[way].append(time.monotonic() - began)
             check_stored(staying.target, load.walks, acknowledged)
-            leaving.start()
-        load.moves_on()
+            if turn + 1 < len(ways):
+                leaving.start()
         load.stop()
-        return compare(load.walks, replicas[0].target, folder, model, dict(ALONE)), stood_s
+        return compare(load.walks, staying.target), stood_s
     finally:
         for replica in replicas:
             replica.end()

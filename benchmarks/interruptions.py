@@ -1,6 +1,6 @@
 """Streams under interruption, beside the same streams without: for ``crash`` and ``handover``.
 
-Sessions stream frames and keep every reply. Afterwards the same frames go to a service that
+Sessions stream frames and keep every reply. Afterwards the same frames go to other sessions, which
 nobody interrupts, and the replies are compared, forecast by forecast.
 """
 
@@ -12,12 +12,10 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 import trajectron_client as tc
-from benchmarks.replica import Replica
 
 SEED = 7
 # Alone in its batch, a forecast is the same to the last bit; see DESIGN.md on determinism.
@@ -33,14 +31,10 @@ class Walk:
     """One session's stream: its frames, its replies in order, and what went wrong."""
 
     number: int
+    session_id: str
     replies: list[tc.StreamReply] = field(default_factory=list)
     reconnects: int = 0
     fault: BaseException | None = None
-
-    @property
-    def session_id(self) -> str:
-        """The session's name."""
-        return f"walk-{self.number}"
 
     def frame(self, step: int) -> tc.Frame:
         """Three people who walk past each other; steps and walks alike give the same."""
@@ -72,7 +66,7 @@ class Load:
     """Walks that stream at once, each in a thread, until they are told to stop."""
 
     def __init__(self, targets: Sequence[str], sessions: int) -> None:
-        self.walks = [Walk(number) for number in range(sessions)]
+        self.walks = [Walk(number, f"walk-{number}") for number in range(sessions)]
         self._targets = targets
         self._stop = threading.Event()
         self._threads = [
@@ -162,45 +156,37 @@ def check_stored(target: str, walks: Sequence[Walk], acknowledged: Sequence[int]
                 raise RuntimeError(f"{walk.session_id}: {info} counts other frames than were sent")
 
 
-def compare(
-    walks: Sequence[Walk], target: str, folder: Path, model: str, settings: dict[str, str]
-) -> Comparison:
-    """Sends the same frames to a service that nobody interrupts, and compares the replies.
+def compare(walks: Sequence[Walk], target: str) -> Comparison:
+    """Sends the same frames again, to sessions that nobody interrupts, and compares the replies.
 
     Args:
         walks: what was interrupted; ended by now.
-        target: a replica that has their sessions.
-        folder: for the log of the other service.
-        model: as theirs.
-        settings: as theirs but for the store.
+        target: a replica that has their sessions, and runs on undisturbed.
     """
     lost = twice = again = forecasts = passed = identical = beyond = 0
     largest = 0.0
-    quiet = Replica(folder, model, settings | {"store": "memory"})
-    quiet.start()
-    try:
-        with tc.Client(target) as client:
-            for walk in walks:
-                version = client.get_session(walk.session_id).info.version
-                sent = len(walk.replies)
-                numbers = [reply.sequence for reply in walk.replies]
-                lost += max(0, sent - version) + len(set(range(1, sent + 1)) - set(numbers))
-                twice += max(0, version - sent) + sent - len(set(numbers))
-                other = Walk(walk.number)
-                other.stream((quiet.target,), (other.frame(step) for step in range(sent)))
-                for reply, wanted in zip(walk.replies, other.replies, strict=True):
-                    again += reply.result.outcome is tc.Outcome.DUPLICATE
-                    if reply.forecast is None:
-                        passed += 1
-                        continue
-                    assert wanted.forecast is not None  # asked for, and nothing came between
-                    differs_m = difference_m(reply.forecast, wanted.forecast)
-                    forecasts += 1
-                    identical += differs_m == 0.0
-                    beyond += differs_m > _TOLERANCE_M
-                    largest = max(largest, differs_m)
-    finally:
-        quiet.end()
+    with tc.Client(target) as client:
+        for walk in walks:
+            version = client.get_session(walk.session_id).info.version
+            sent = len(walk.replies)
+            numbers = [reply.sequence for reply in walk.replies]
+            lost += max(0, sent - version) + len(set(range(1, sent + 1)) - set(numbers))
+            twice += max(0, version - sent) + sent - len(set(numbers))
+            other = Walk(walk.number, f"undisturbed-{walk.number}")
+            other.stream((target,), (other.frame(step) for step in range(sent)))
+            if other.reconnects:
+                raise RuntimeError("the run to compare with was interrupted itself")
+            for reply, wanted in zip(walk.replies, other.replies, strict=True):
+                again += reply.result.outcome is tc.Outcome.DUPLICATE
+                if reply.forecast is None:
+                    passed += 1
+                    continue
+                assert wanted.forecast is not None  # asked for, and nothing came between
+                differs_m = difference_m(reply.forecast, wanted.forecast)
+                forecasts += 1
+                identical += differs_m == 0.0
+                beyond += differs_m > _TOLERANCE_M
+                largest = max(largest, differs_m)
     return Comparison(
         sessions=len(walks),
         frames=sum(len(walk.replies) for walk in walks),

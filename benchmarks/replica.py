@@ -48,6 +48,7 @@ class Replica:
             **{f"TRAJECTRON_{name.upper()}": value for name, value in settings.items()},
         }
         self._process: subprocess.Popen[bytes] | None = None
+        self._began = 0.0
 
     @property
     def target(self) -> str:
@@ -61,18 +62,27 @@ class Replica:
 
     def start(self) -> float:
         """Starts it; the seconds until it was ready."""
-        began = time.monotonic()
+        self.launch()
+        return self.ready()
+
+    def launch(self) -> None:
+        """Starts it, and does not wait."""
+        self._began = time.monotonic()
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
                 self._command, env=self._environment, stdout=log, stderr=log
             )
+
+    def ready(self) -> float:
+        """Returns once it takes work: the seconds since it was started."""
+        assert self._process is not None
         with tc.Client(self.target) as client:
             while not client.is_ready(timeout_s=1.0):
-                if self._process.poll() is not None or time.monotonic() - began > _PATIENCE_S:
+                if self._process.poll() is not None or time.monotonic() - self._began > _PATIENCE_S:
                     self.end()
                     raise RuntimeError(f"the service did not become ready:\n{self.log[-2000:]}")
                 time.sleep(0.02)
-        return time.monotonic() - began
+        return time.monotonic() - self._began
 
     def kill(self) -> None:
         """SIGKILL: it has no time for anything."""

@@ -11,6 +11,8 @@ from typing import Any, Literal, NamedTuple, cast
 PEDESTRIAN_SPEED_LIMIT_MPS = 12.42
 MAX_HORIZON = 60
 MAX_SAMPLES = 2000
+# Analytic forecasts leave out the latent values that are less probable than this.
+MODE_PROBABILITY_FLOOR = 0.002
 
 # Bounds far beyond any use: a damaged file cannot ask for gigabytes.
 _LARGEST = {

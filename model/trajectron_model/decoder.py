@@ -178,17 +178,17 @@ class Decoder(nn.Module):
             steps.append(velocity)
         return torch.stack(steps, dim=1)
 
-    def moments(self, prepared: Prepared, horizon: int, limit: float) -> tuple[Tensor, Tensor]:
-        """Rollouts of every latent value on the mixture's mean.
+    def moments(
+        self, prepared: Prepared, agent: Tensor, latent: Tensor, horizon: int, limit: float
+    ) -> tuple[Tensor, Tensor]:
+        """Rollouts on the mixture's mean, of agent [R] under latent value [R] each.
 
         At each step the mixture is merged to one Gaussian and its mean, limited to ``limit``
         (in units of the speed scale), is fed back.
 
         Returns:
-            velocity means [N Z, H, 2] and the covariances of the changes of velocity
-            [N Z, H, 3].
+            velocity means [R, H, 2] and the covariances of the changes of velocity [R, H, 3].
         """
-        agent, latent = self.every_latent(len(prepared.velocity))
         done = decoding.moments(self, prepared, agent, latent, horizon, limit)
         if done is not None:
             return done

@@ -3,11 +3,7 @@
 Three forms (paper, section 5, and its note on analytic mixtures):
 
 * ``full``: z ~ p(z|x), y ~ p(y|x,z); ``z_best``: z = argmax p(z|x), y ~ p(y|x,z).
-* ``gmm``: no sampling. Every latent value is one mode: its velocity mixture is merged to
-  one Gaussian at each step of a rollout on its mean, and carried to position space as a
-  random walk in velocity (``integration.RandomWalk``). Two approximations: the identity of
-  mixture components is not followed from step to step, and increments of velocity are
-  taken as independent of the velocity reached.
+* ``gmm``: no sampling. Every latent value that is not negligible is one mode (``modes``).
 
 An agent that has shown no direction gets an isotropic forecast: each of its samples is
 turned by a uniform angle of its own, and its modes are the moments of that.
@@ -30,12 +26,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trajectron_model.config import MAX_HORIZON, MAX_SAMPLES
-from trajectron_model.dispersion import disperse
+from trajectron_model.config import MAX_HORIZON, MAX_SAMPLES, MODE_PROBABILITY_FLOOR
 from trajectron_model.encoders import EncoderState
-from trajectron_model.features import Kinematics, from_frame, to_frame
+from trajectron_model.features import Kinematics, from_frame
 from trajectron_model.gmm import choose
-from trajectron_model.integration import RandomWalk, integrate
+from trajectron_model.integration import integrate
+from trajectron_model.kernels.threads import torch_alone
+from trajectron_model.modes import (
+    mode_moments,
+    start_velocity,
+    without_direction,
+    without_negligible,
+)
+from trajectron_model.node_model import NodeModel
 from trajectron_model.noise import SAMPLINGS, Sampling, scene_noise
 from trajectron_model.state import SceneState, stack
 
@@ -43,9 +46,6 @@ if TYPE_CHECKING:
     from trajectron_model.trajectron import Trajectron
 
 Float32 = NDArray[np.float32]
-
-# A position is never known better than this: keeps covariances positive definite.
-_VARIANCE_FLOOR_M2 = 1e-6
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,11 @@ class ForecastRequest:
         """Whether means and covariances of modes are computed."""
         return self.include_modes or self.mode == "gmm"
 
+    @property
+    def mode_probability_floor(self) -> float:
+        """Modes that are less probable are left out, and their probability given as zero."""
+        return MODE_PROBABILITY_FLOOR if self.mode == "gmm" else 0.0
+
 
 @dataclass(frozen=True)
 class SceneForecast:
@@ -131,6 +136,13 @@ def forecast_scenes(
     """The futures that each request asks of its state; see ``Trajectron.forecast``."""
     if not states:
         return []
+    with torch_alone():
+        return _forecast_scenes(model, states, requests)
+
+
+def _forecast_scenes(
+    model: Trajectron, states: Sequence[SceneState], requests: Sequence[ForecastRequest]
+) -> list[SceneForecast]:
     picked = [_rows(model, s, r) for s, r in zip(states, requests, strict=True)]
     results = [
         _blank(model, s, r, rows) for s, r, rows in zip(states, requests, picked, strict=True)
@@ -210,27 +222,20 @@ def _groups(
         groups[kind, horizon] = _Agents(
             encoding=encoding,
             motion=Kinematics(*(column[index] for column in stacked.motion)),
-            log_prior=networks.latent.prior(encoding),
+            log_prior=_prior(networks, encoding, [requests[number] for number, _, _ in found]),
             keys=[(number, at) for number, at, _ in found],
             ids=[stacked.ids[row] for _, _, row in found],
         )
     return groups
 
 
-def start_velocity(model: Trajectron, motion: Kinematics, kind: int) -> Tensor:
-    """y_0 [N, 2]: the last causal velocity in the node's frame, over the type's speed scale."""
-    frame = model.features.frame(motion)
-    velocity = to_frame(motion.velocity, frame) / model.config.types[kind].speed_scale_mps
-    if not model.features.isotropic_without_heading:
-        return velocity
-    return torch.where(motion.heading_known.unsqueeze(-1), velocity, 0.0)
-
-
-def without_direction(model: Trajectron, motion: Kinematics) -> Tensor:
-    """[N] whether the agent's forecast has no direction of its own."""
-    if model.features.isotropic_without_heading:
-        return ~motion.heading_known
-    return torch.zeros_like(motion.heading_known)
+def _prior(networks: NodeModel, encoding: Tensor, asked: Sequence[ForecastRequest]) -> Tensor:
+    """log p(z|x) [B, Z] as each agent's request counts it."""
+    log_prior = networks.latent.prior(encoding)
+    floors = [request.mode_probability_floor for request in asked]
+    if not any(floors):
+        return log_prior
+    return without_negligible(log_prior, log_prior.new_tensor(floors))
 
 
 def _fill_modes(
@@ -255,64 +260,6 @@ def _fill_modes(
         result = results[number]
         assert result.mean is not None and result.covariance is not None
         result.mean[at], result.covariance[at] = means[row], covariances[row]
-
-
-def mode_moments(
-    model: Trajectron,
-    kind: int,
-    encoding: Tensor,
-    log_prior: Tensor,
-    motion: Kinematics,
-    horizon: int,
-) -> tuple[Tensor, Tensor]:
-    """Position-space Gaussian of every latent value at every step.
-
-    Args:
-        kind: type index of the N nodes.
-        encoding: [N, D] h_enc.
-        log_prior: [N, Z] log p(z|x).
-        motion: of the N nodes.
-        horizon: H.
-
-    Returns:
-        mean [N, Z, H, 2] as offsets in metres and covariance [N, Z, H, 3], world axes.
-    """
-    agent_type, dt_s = model.config.types[kind], model.config.dt_s
-    nodes, values = encoding.shape[0], model.config.latent_values
-    decoder, scale = model.node_model(kind).decoder, agent_type.speed_scale_mps
-    prepared = decoder.prepare(encoding, start_velocity(model, motion, kind))
-    velocity, increment = decoder.moments(prepared, horizon, agent_type.speed_limit_mps / scale)
-    if agent_type.stationary:
-        increment = torch.zeros_like(increment)
-    mean = integrate(velocity, dt_s) * scale  # [N Z, H, 2]
-    walk = RandomWalk(dt_s, increment[:, 0])
-    spread = [walk.step(increment[:, t]) * scale**2 for t in range(horizon)]
-    covariance = torch.stack(spread, dim=1)  # [N Z, H, 3]
-    mean = mean.reshape(nodes, values, horizon, 2)
-    floor = covariance.new_tensor([_VARIANCE_FLOOR_M2, 0.0, _VARIANCE_FLOOR_M2])
-    covariance = covariance.reshape(nodes, values, horizon, 3) + floor
-    covariance = disperse(covariance, log_prior, agent_type.dispersion)
-    axis = model.features.frame(motion)[:, None, None, :]
-    turned = without_direction(model, motion)[:, None, None, None]
-    square = mean.square().sum(-1) + covariance[..., 0] + covariance[..., 2]
-    round_ = torch.stack([0.5 * square, torch.zeros_like(square), 0.5 * square], dim=-1)
-    covariance = torch.where(turned, round_, _rotate(covariance, axis))
-    mean = torch.where(turned, 0.0, from_frame(mean, axis))
-    return mean, covariance
-
-
-def _rotate(covariance: Tensor, axis: Tensor) -> Tensor:
-    """Covariances [..., 3] from the frame with first axis ``axis`` [..., 2] to the world's."""
-    c, s = axis[..., 0], axis[..., 1]
-    xx, xy, yy = covariance.unbind(dim=-1)
-    return torch.stack(
-        [
-            c * c * xx - 2.0 * c * s * xy + s * s * yy,
-            c * s * (xx - yy) + (c * c - s * s) * xy,
-            s * s * xx + 2.0 * c * s * xy + c * c * yy,
-        ],
-        dim=-1,
-    )
 
 
 def _fill_samples(

@@ -21,27 +21,21 @@ def limit_speed(velocity: Tensor, limit: float) -> Tensor:
     return velocity * factor.unsqueeze(-1)
 
 
-class RandomWalk:
+def walk(increment_cov: Tensor, dt_s: float) -> Tensor:
     """Moments of position when velocity is a random walk whose increments are independent.
 
-    With v_t = v_{t-1} + d_t and x_t = x_{t-1} + v_t dt, the covariance of (x, v) is carried
-    exactly, so errors of successive velocities correlate. Holding velocities independent
-    instead would be under-dispersed: variances would grow with t and not with t^3.
+    With v_t = v_{t-1} + d_t and x_t = x_{t-1} + v_t dt, the increment at step r counts
+    k = t - r + 1 times in x_t, so the position's covariance is dt^2 times the sum over r of
+    k^2 cov(d_r). Cumulated sums of cumulated sums weigh by k, and once more by k (k + 1) / 2.
+    Holding velocities independent instead would be under-dispersed: variances would grow with
+    t and not with t^3.
+
+    Args:
+        increment_cov: [..., H, 3] (m/s)^2 of each step.
+        dt_s: of a step.
+
+    Returns:
+        [..., H, 3] m^2.
     """
-
-    def __init__(self, dt_s: float, like: Tensor) -> None:
-        """Starts at a known position and velocity; covariances are [..., 3] like ``like``."""
-        self.dt_s = dt_s
-        self.position_cov = like.new_zeros(like.shape)
-        self.cross_cov = like.new_zeros(like.shape)
-        self.velocity_cov = like.new_zeros(like.shape)
-
-    def step(self, increment_cov: Tensor) -> Tensor:
-        """Adds one increment of covariance [..., 3] (m/s)^2; returns the position's, m^2."""
-        dt = self.dt_s
-        self.velocity_cov = self.velocity_cov + increment_cov
-        self.position_cov = (
-            self.position_cov + 2.0 * dt * self.cross_cov + dt * dt * self.velocity_cov
-        )
-        self.cross_cov = self.cross_cov + dt * self.velocity_cov
-        return self.position_cov
+    by_k = increment_cov.cumsum(dim=-2).cumsum(dim=-2)
+    return (2.0 * by_k.cumsum(dim=-2) - by_k) * (dt_s * dt_s)

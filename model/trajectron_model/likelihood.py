@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trajectron_model.features import Kinematics, to_frame
-from trajectron_model.forecast import start_velocity, without_direction
 from trajectron_model.history import gather
+from trajectron_model.modes import start_velocity, without_direction
 from trajectron_model.node_model import Likelihood
 from trajectron_model.state import SceneState, stack
 from trajectron_model.trajectron import Trajectron, rows_by_type

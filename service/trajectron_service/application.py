@@ -35,10 +35,12 @@ from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
 from trajectron_service.session_errors import STREAM_ENDED
 from trajectron_service.sessions import Change, Sessions
 from trajectron_service.settings import Settings
-from trajectron_service.stores import SessionKey, SessionStore
+from trajectron_service.stores import SessionKey, SessionStore, StoreError
 from trajectron_service.stores.memory import MemoryStore
 from trajectron_service.streams import Stream, StreamLimits
 from trajectron_service.timebase import Timeline
+from trajectron_service.watching.accuracy import LiveAccuracy, WatchLimits
+from trajectron_service.watching.drawing import mixture_drawer
 from trajectron_service.work import WorkInHand
 
 __all__ = ["Application", "Stream"]
@@ -89,7 +91,7 @@ class Application:
         self._clock = clock or steady_unix_clock()
         self._choices = Choices(settings, engine.models, engine.default_model, draw_seed)
         self._batcher = Batcher[SceneJob, SceneResult](
-            engine.run,
+            self._run,
             queue_size=settings.queue_size,
             max_batch_cost=settings.max_batch_points,
             batch_s=_BATCH_S,
@@ -103,7 +105,9 @@ class Application:
             metrics=metrics,
             max_sessions=settings.max_sessions,
             park_after_s=settings.park_after_s,
+            on_close=self._on_close,
         )
+        self._accuracy = self._watch() if settings.live_accuracy else None
         self._streams: weakref.WeakValueDictionary[SessionKey, Stream] = (
             weakref.WeakValueDictionary()
         )
@@ -116,12 +120,26 @@ class Application:
         metrics.in_hand.set_function(lambda: self._work.count)
         metrics.ready.set_function(lambda: float(self.ready))
 
+    def _watch(self) -> LiveAccuracy:
+        settings = self._settings
+        return LiveAccuracy(
+            WatchLimits(settings.live_accuracy_budget, settings.live_accuracy_pending),
+            self._metrics.accuracy,
+            self._batcher.run_alone,
+            lambda model: self._engine.models[model].info.horizon,
+        )
+
     async def start(self) -> None:
         """Warms the models up and begins to close idle sessions; then ``ready`` is true."""
         if self._settings.warm_up:
             await self._batcher.run_alone(self._engine.warm_up)
         self._housekeeper = asyncio.create_task(self._keep_house(), name="housekeeper")
         self._started = True
+
+    @property
+    def metrics(self) -> Metrics:
+        """What it was told to tell everything."""
+        return self._metrics
 
     @property
     def ready(self) -> bool:
@@ -145,6 +163,8 @@ class Application:
             self._housekeeper.cancel()
             with suppress(asyncio.CancelledError):
                 await self._housekeeper
+        if self._accuracy is not None:
+            await self._accuracy.close()
         await self._batcher.close()
 
     def list_models(self) -> tuple[ModelInfo, ...]:
@@ -236,16 +256,21 @@ class Application:
         """The futures from the session's newest frame."""
         key = _key(session_id)
 
-        async def look(record: SceneRecord) -> tuple[Change, Forecast]:
+        async def look(record: SceneRecord) -> tuple[Change, tuple[SceneRecord, Forecast]]:
             after, forecast = await self._forecaster.forecast(
                 record, options, key=key, deadline=limit
             )
-            return Change(after), forecast
+            return Change(after), (after, forecast)
 
         with self._work.taken():
             self._choices.check_options(options)
             async with self._until(deadline) as limit:
-                return await self._sessions.change(key, look)
+                record, forecast = await self._sessions.change(key, look)
+        newest = record.timeline.newest
+        if self._accuracy is not None and newest is not None:
+            draw = mixture_drawer(self._engine, record)
+            self._accuracy.forecast(key, record.version, newest, forecast, draw)
+        return forecast
 
     async def open_stream(
         self, session_id: str | None, config: SessionConfig, options: StreamOptions
@@ -305,7 +330,9 @@ class Application:
     ) -> list[FrameAnswer]:
         """Folds frames into a session."""
 
-        async def observe(record: SceneRecord) -> tuple[Change, list[FrameAnswer]]:
+        async def observe(
+            record: SceneRecord,
+        ) -> tuple[Change, tuple[SceneRecord, list[FrameAnswer]]]:
             after, packed, answers = await self._forecaster.fold(
                 record,
                 requests,
@@ -314,9 +341,31 @@ class Application:
                 pack=self._sessions.durable,
                 strict=strict,
             )
-            return Change(after, packed), answers
+            return Change(after, packed), (after, answers)
 
-        return await self._sessions.change(key, observe, extends=True)
+        record, answers = await self._sessions.change(key, observe, extends=True)
+        self._note_answers(key, record, answers)
+        return answers
+
+    def _note_answers(
+        self, key: SessionKey, record: SceneRecord, answers: Sequence[FrameAnswer]
+    ) -> None:
+        """Tells of accepted frames and of forecasts from them; ``record`` is that after them."""
+        if self._accuracy is None:
+            return
+        for answer in answers:
+            if answer.seen is None:
+                continue
+            version = answer.result.version
+            self._accuracy.frame(key, version, answer.seen)
+            if answer.forecast is not None:
+                last = version == record.version
+                draw = mixture_drawer(self._engine, record) if last else None
+                self._accuracy.forecast(key, version, answer.seen, answer.forecast, draw)
+
+    def _on_close(self, key: SessionKey) -> None:
+        if self._accuracy is not None:
+            self._accuracy.closed(key)
 
     @contextmanager
     def _streaming(self, key: SessionKey) -> Iterator[None]:
@@ -358,21 +407,35 @@ class Application:
                 ErrorKind.DEADLINE_EXCEEDED, "the deadline passed before the work was done"
             ) from error
 
+    def _run(self, jobs: Sequence[SceneJob]) -> Sequence[SceneResult]:
+        """A batch, on the inference thread."""
+        with self._metrics.tracing.batch([job.ticket for job in jobs]):
+            return self._engine.run(jobs)
+
     def _note_batch(self, report: BatchReport) -> None:
         self._metrics.batch_jobs.observe(report.entries)
+        self._metrics.inference_seconds.inc(report.ran_s)
+        if self._accuracy is not None:
+            self._accuracy.inferred(report.ran_s)
         for waited_s in report.waited_s:
             self._metrics.stage_seconds.labels("queue").observe(waited_s)
+
+    async def keep_house(self) -> None:
+        """Keeps sessions open that streams hold, closes those expired, parks those unused."""
+        await self._sessions.renew()
+        await self._sessions.reap()
+        await self._sessions.park()
 
     async def _keep_house(self) -> None:
         """Closes sessions that have expired and parks those unused, until cancelled."""
         while True:
             await asyncio.sleep(HOUSEKEEPING_S)
             try:
-                await self._sessions.renew()
-                await self._sessions.reap()
-                await self._sessions.park()
-            except Exception:
+                await self.keep_house()
+            except (ServiceError, StoreError) as error:
                 # A full queue or a store that is away: the next round tries again.
+                log.warning("housekeeping put off", reason=str(error))
+            except Exception:
                 log.exception("housekeeping failed")
 
 

@@ -15,8 +15,9 @@ from typing import Protocol, cast
 import numpy as np
 import torch
 
-from trajectron_model import kernels, registry
-from trajectron_model.state import SceneFrame, SceneState
+from trajectron_model import kernels, online, packed, registry
+from trajectron_model.packed import Layout, PackedScene
+from trajectron_model.state import SceneFrame
 from trajectron_model.trajectron import Trajectron
 from trajectron_service.draws import forecast_all
 from trajectron_service.messages import (
@@ -84,6 +85,7 @@ class Engine:
         if not models:
             raise ValueError("an engine needs at least one model")
         self._networks = {loaded.name: loaded.model.eval() for loaded in models}
+        self._layouts = {n: Layout.of(network.config) for n, network in self._networks.items()}
         self._default = models[0].name
         self._facts = {loaded.name: _facts(loaded, loaded is models[0]) for loaded in models}
         self._observe = observe
@@ -120,7 +122,7 @@ class Engine:
     @torch.inference_mode()
     def run(self, jobs: Sequence[SceneJob]) -> list[SceneResult]:
         """Does all jobs together, in the order given; one fault fails all."""
-        tables = [_table(job) for job in jobs]
+        tables = [_table(job, self._networks[job.model]) for job in jobs]
         forecasts: list[list[tuple[AgentForecast, ...]]] = [[] for _ in jobs]
         graphs: dict[int, SceneGraph] = {}
         of_model: dict[str, list[int]] = defaultdict(list)
@@ -138,16 +140,17 @@ class Engine:
             stepped = time.perf_counter()
             if any(jobs[i].steps for i in indices):
                 self._observe("encode", stepped - start)
-            for (i, _), state in zip(heads[len(asked) :], states[len(asked) :], strict=True):
-                graphs[i] = _graph(network, state)
+            for (i, _), scene in zip(heads[len(asked) :], states[len(asked) :], strict=True):
+                graphs[i] = _graph(network, scene)
             if asked:
                 tasks = [task for _, task in asked]
-                drawn = forecast_all(network, tasks, states[: len(asked)])
+                live = [online.state_of(network, scene) for scene in states[: len(asked)]]
+                drawn = forecast_all(network, tasks, live)
                 for (i, _), agents in zip(asked, drawn, strict=True):
                     forecasts[i].append(agents)
                 self._observe("sample", time.perf_counter() - stepped)
         return [
-            _result(job, table, tuple(forecasts[i]), graphs.get(i))
+            _result(job, table, tuple(forecasts[i]), graphs.get(i), self._layouts[job.model])
             for i, (job, table) in enumerate(zip(jobs, tables, strict=True))
         ]
 
@@ -176,13 +179,13 @@ def load(
     return Engine(loaded, observe=observe)
 
 
-def pack(states: Iterable[SceneState]) -> bytes:
+def pack(scenes: Iterable[PackedScene], layout: Layout) -> bytes:
     """States as bytes: each with its length before it."""
-    chunks = [state.to_bytes() for state in states]
+    chunks = [scene.to_bytes(layout) for scene in scenes]
     return b"".join(part for chunk in chunks for part in (_LENGTH.pack(len(chunk)), chunk))
 
 
-def unpack(data: bytes) -> tuple[SceneState, ...]:
+def unpack(data: bytes, layout: Layout) -> tuple[PackedScene, ...]:
     """The inverse of ``pack``; raises ValueError for bytes that are damaged."""
     states = []
     start = 0
@@ -193,7 +196,7 @@ def unpack(data: bytes) -> tuple[SceneState, ...]:
         start += _LENGTH.size
         if start + size > len(data):
             raise ValueError("packed states end within a state")
-        states.append(SceneState.from_bytes(data[start : start + size]))
+        states.append(PackedScene.from_bytes(data[start : start + size], layout))
         start += size
     return tuple(states)
 
@@ -214,31 +217,30 @@ def _facts(loaded: LoadedModel, is_default: bool) -> ModelFacts:
     return ModelFacts(info, {name: config.speed_limit_mps(name) for name in config.node_types})
 
 
-def _live(states: States) -> tuple[SceneState, ...]:
+def _live(states: States, network: Trajectron) -> tuple[PackedScene, ...]:
     if isinstance(states, bytes):
-        return unpack(states)
-    return tuple(cast("SceneState", state) for state in states)
+        return unpack(states, Layout.of(network.config))
+    return tuple(cast("PackedScene", state) for state in states)
 
 
-def _table(job: SceneJob) -> dict[int, SceneState]:
+def _table(job: SceneJob, network: Trajectron) -> dict[int, PackedScene]:
     """The job's states by serial number."""
-    return dict(zip(job.serials, _live(job.states), strict=True))
+    return dict(zip(job.serials, _live(job.states, network), strict=True))
 
 
 def _source(
-    network: Trajectron, table: Mapping[int, SceneState], source: int | None, drop: frozenset[str]
-) -> SceneState:
+    network: Trajectron, table: Mapping[int, PackedScene], source: int | None, drop: frozenset[str]
+) -> PackedScene:
     if source is None:
-        return network.initial_state()
-    state = table[source]
-    return state.keep([agent for agent in state.ids if agent not in drop]) if drop else state
+        return packed.blank_scene()
+    return packed.without(table[source], drop, network.config) if drop else table[source]
 
 
 def _frame(observation: Observation) -> SceneFrame:
     return SceneFrame(observation.time_s, observation.ids, observation.types, observation.positions)
 
 
-def _step_all(network: Trajectron, work: Sequence[tuple[SceneJob, dict[int, SceneState]]]) -> None:
+def _step_all(network: Trajectron, work: Sequence[tuple[SceneJob, dict[int, PackedScene]]]) -> None:
     """Makes all steps of all jobs, as many at once as are ready; fills the tables."""
     position = [0] * len(work)
     # States that nothing needs any more are let go: a long history would keep hundreds.
@@ -259,7 +261,7 @@ def _step_all(network: Trajectron, work: Sequence[tuple[SceneJob, dict[int, Scen
         if not ready:
             return
         sources = [_source(network, work[i][1], s.source, s.drop) for i, s in ready]
-        states = network.step(sources, [_frame(step.frame) for _, step in ready])
+        states = online.step(network, sources, [_frame(step.frame) for _, step in ready])
         for (index, step), state in zip(ready, states, strict=True):
             table = work[index][1]
             table[step.result] = state
@@ -269,48 +271,50 @@ def _step_all(network: Trajectron, work: Sequence[tuple[SceneJob, dict[int, Scen
 
 
 def _at_heads(
-    network: Trajectron, heads: Sequence[tuple[Mapping[int, SceneState], Head]]
-) -> list[SceneState]:
+    network: Trajectron, heads: Sequence[tuple[Mapping[int, PackedScene], Head]]
+) -> list[PackedScene]:
     """The state at each head, after its provisional step where it has one."""
     states = [_source(network, table, where.source, where.drop) for table, where in heads]
     provisional = [i for i, (_, where) in enumerate(heads) if where.frame is not None]
     frames = [_frame(where.frame) for _, where in heads if where.frame is not None]
     if provisional:
-        stepped = network.step([states[i] for i in provisional], frames)
+        stepped = online.step(network, [states[i] for i in provisional], frames)
         for i, state in zip(provisional, stepped, strict=True):
             states[i] = state
     return states
 
 
-def _graph(network: Trajectron, state: SceneState) -> SceneGraph:
-    types = network.config.node_types
+def _graph(network: Trajectron, scene: PackedScene) -> SceneGraph:
+    names = network.config.node_types
+    records = np.frombuffer(scene.nodes, dtype=Layout.of(network.config).node)
     rows = zip(
-        state.ids,
-        state.node_type.tolist(),
-        state.position.tolist(),
-        state.observations.tolist(),
-        state.last_seen_s.tolist(),
+        scene.ids,
+        records["type"].tolist(),
+        records["position"].tolist(),
+        records["observations"].tolist(),
+        records["last_seen_s"].tolist(),
         strict=True,
     )
-    nodes = tuple(GraphNode(i, types[t], x, y, n, s) for i, t, (x, y), n, s in rows)
+    nodes = tuple(GraphNode(i, names[t], x, y, n, s) for i, t, (x, y), n, s in rows)
     edges = tuple(
         GraphEdge(e.receiver_id, e.sender_id, e.age_steps, e.gone_steps, e.modulation)
-        for e in state.edges()
+        for e in packed.edges_of(scene, network.config)
     )
     return SceneGraph(nodes, edges)
 
 
 def _result(
     job: SceneJob,
-    table: Mapping[int, SceneState],
+    table: Mapping[int, PackedScene],
     forecasts: tuple[tuple[AgentForecast, ...], ...],
     graph: SceneGraph | None,
+    layout: Layout,
 ) -> SceneResult:
     kept = [table[serial] for serial in job.keep]
     return SceneResult(
         states=tuple(State(state) for state in kept),
-        packed=pack(kept) if job.pack else None,
+        packed=pack(kept, layout) if job.pack else None,
         forecasts=forecasts,
         graph=graph,
-        edge_count=len(kept[-1].graph.receiver) if kept else 0,
+        edge_count=kept[-1].edge_count if kept else 0,
     )

@@ -29,7 +29,7 @@ from trajectron_service.metrics import Metrics
 from trajectron_service.pace import Work
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
-from trajectron_service.timebase import Step, advance, classify, head
+from trajectron_service.timebase import Observation, Step, advance, classify, head
 from trajectron_service.validation import Checked, check, quoted
 
 log = logs.get(__name__)
@@ -68,13 +68,14 @@ class FrameAnswer:
     """What became of one frame; ``forecast`` or ``error`` where one was asked for.
 
     ``stale`` marks a repeated frame of a stream that newer ones have followed: what was asked
-    of it is not answered any more.
+    of it is not answered any more. ``seen`` is the frame as checked, where it was accepted.
     """
 
     result: FrameResult
     forecast: Forecast | None = None
     error: ServiceError | None = None
     stale: bool = False
+    seen: Observation | None = None
 
 
 @dataclass(eq=False)
@@ -221,7 +222,7 @@ class Forecaster:
             taken = advance(timeline, checked.observation)
             after = dataclasses.replace(record, timeline=taken.timeline, version=version + 1)
             result = FrameResult(taken.outcome, version + 1, taken.gaps, checked.ignored)
-            return after, FrameAnswer(result), taken.steps
+            return after, FrameAnswer(result, seen=checked.observation), taken.steps
         if outcome is Outcome.DUPLICATE:
             result = FrameResult(outcome, version, ignored_agents=checked.ignored)
             return record, FrameAnswer(result), ()
@@ -315,6 +316,12 @@ class Forecaster:
         *,
         urgent: bool = False,
     ) -> list[SceneResult]:
+        ticket = self._metrics.tracing.ticket()
+        if ticket is not None:
+            parts = [
+                dataclasses.replace(part, job=dataclasses.replace(part.job, ticket=ticket))
+                for part in parts
+            ]
         try:
             return await self._batcher.submit_parts(
                 parts, key=key, deadline=deadline, urgent=urgent

@@ -236,6 +236,7 @@ def forecast_message(forecast: core.Forecast) -> pb.Forecast:
         reference_time_s=forecast.reference_time,
         time_offsets_s=forecast.time_offsets_s,
         sample_semantics=_SEMANTICS_OUT[forecast.sampling],
+        mode_probability_floor=forecast.mode_probability_floor,
         agents=[_agent_forecast(agent) for agent in forecast.agents],
     )
 

@@ -16,10 +16,23 @@ from trajectron_service import logs
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.grpc_errors import abort
 from trajectron_service.metrics import Metrics
+from trajectron_service.tracing import CARRIED, TRACEPARENT
 
 # Requests, answers and handlers of all methods: gRPC gives them no common type.
 Handler: TypeAlias = "grpc.RpcMethodHandler[Any, Any]"
 Context = grpc.aio.ServicerContext[Any, Any]
+
+_FAULTS = frozenset(
+    code.name
+    for code in (
+        grpc.StatusCode.UNKNOWN,
+        grpc.StatusCode.INTERNAL,
+        grpc.StatusCode.UNAVAILABLE,
+        grpc.StatusCode.DEADLINE_EXCEEDED,
+        grpc.StatusCode.DATA_LOSS,
+        grpc.StatusCode.UNIMPLEMENTED,
+    )
+)
 
 log = logs.get(__name__)
 
@@ -70,7 +83,8 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
 
     def _unary(self, method: str, behaviour: Any) -> Any:
         async def call(request: Any, context: Context) -> Any:
-            with self._measured(method) as record:
+            with self._measured(method, context) as record:
+                await record.send_traceparent(context)
                 try:
                     return await behaviour(_checked(request), context)
                 except Exception as error:  # noqa: BLE001  every fault becomes a status
@@ -80,7 +94,8 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
 
     def _stream(self, method: str, behaviour: Any, checked: Callable[[Any], Any]) -> Any:
         async def call(request: Any, context: Context) -> AsyncIterator[Any]:
-            with self._measured(method) as record:
+            with self._measured(method, context) as record:
+                await record.send_traceparent(context)
                 try:
                     # Closed here, not by the garbage collector: a cancelled stream frees its
                     # session at once.
@@ -93,8 +108,14 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         return call
 
     @contextmanager
-    def _measured(self, method: str) -> Iterator[_Record]:
-        record = _Record(method)
+    def _measured(self, method: str, context: Context) -> Iterator[_Record]:
+        carried = {
+            str(name): str(value)
+            for name, value in context.invocation_metadata() or ()
+            if name in CARRIED
+        }
+        call = self._metrics.tracing.call("grpc", method, carried)
+        record = _Record(method, call.traceparent)
         start = time.perf_counter()
         try:
             yield record
@@ -104,6 +125,7 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         finally:
             duration_s = time.perf_counter() - start
             self._metrics.request("grpc", method, record.code, duration_s)
+            call.end(method, record.code, failed=record.code in _FAULTS)
             log.info(
                 "call",
                 protocol="grpc",
@@ -134,9 +156,15 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
 class _Record:
     """How a call ended."""
 
-    def __init__(self, method: str) -> None:
+    def __init__(self, method: str, traceparent: str | None) -> None:
         self.code = grpc.StatusCode.OK.name
         self._method = method
+        self._traceparent = traceparent
+
+    async def send_traceparent(self, context: Context) -> None:
+        """Tells the client its trace, before anything else, where there is one."""
+        if self._traceparent is not None:
+            await context.send_initial_metadata(((TRACEPARENT, self._traceparent),))
 
     def failed(self, error: Exception) -> ServiceError:
         """The error to tell the client; one of no known kind is logged whole."""

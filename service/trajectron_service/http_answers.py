@@ -68,6 +68,11 @@ class Forecast(Answer):
         "histories. Those of one agent: `independent_agents`: independent too; "
         "`independent_agents_stratified`: spread evenly, each with the same distribution."
     )
+    mode_probability_floor: float = Field(
+        description="Modes that were less probable than this are left out: their probability is "
+        "zero, the others' sum to one, and their mean and covariance repeat the most probable "
+        "mode's. Above zero for `gmm` only."
+    )
     agents: list[AgentForecast] = Field(description="In the order asked for.")
 
 

@@ -19,7 +19,7 @@ from trajectron_proto.v1 import trajectron_pb2 as pb
 from trajectron_service import grpc_convert as protobuf
 from trajectron_service import http_encode as encode
 from trajectron_service.application import Application
-from trajectron_service.http_body import read_body, while_connected
+from trajectron_service.http_body import read_body, timed, while_connected
 from trajectron_service.http_schemas import (
     CreateSessionRequest,
     ObserveRequest,
@@ -165,6 +165,7 @@ def respond(
     request: Request, as_json: Callable[[], dict[str, Any]], as_message: Callable[[], Message]
 ) -> Response:
     """An answer in the form that the request asks for: JSON, or the contract's message."""
-    if PROTOBUF in request.headers.get("accept", ""):
-        return Response(as_message().SerializeToString(), media_type=PROTOBUF)
-    return json_response(as_json())
+    with timed(request, "serialise"):
+        if PROTOBUF in request.headers.get("accept", ""):
+            return Response(as_message().SerializeToString(), media_type=PROTOBUF)
+        return json_response(as_json())

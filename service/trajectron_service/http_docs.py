@@ -52,11 +52,12 @@ _ERRORS: dict[int, str] = {
     409: "The state of the session or evaluation forbids it: `reason` is SESSION_EXISTS, "
     "FRAME_CONFLICT, FRAME_OUT_OF_ORDER, NO_FRAMES, EVALUATION_EXISTS, EVALUATION_HAS_NO_RESULT "
     "or DATASET_UNAVAILABLE.",
+    410: "What is stored of the session cannot be read any more; it was set aside.",
     413: "The body is too large.",
     422: "A field is missing, mistyped, unknown or out of range: `violations` names it.",
     429: "The queue or the service is full; try again later.",
     500: "A fault of the service; its log has more under the answer's X-Request-Id.",
-    503: "The service is starting or draining; try again, here or elsewhere.",
+    503: "The service is starting or draining, or its store is away; try again, here or elsewhere.",
     504: "Not done before the deadline.",
 }
 _EXAMPLES: tuple[ServiceError, ...] = (
@@ -65,7 +66,13 @@ _EXAMPLES: tuple[ServiceError, ...] = (
     ),
     ServiceError(
         ErrorKind.UNKNOWN_SESSION,
-        'session_id: "crossing-4" is unknown: it was never opened, was closed, or has expired',
+        'session_id: "crossing-4" is unknown: it was closed for want of use at '
+        "2026-12-01T03:18:07+00:00 (600 s unused)",
+    ),
+    ServiceError(
+        ErrorKind.SESSION_DAMAGED,
+        'session_id: what is stored of "crossing-4" cannot be read (its checksum does not fit); '
+        "it was set aside at 2026-12-01T03:18:07+00:00; open a new session",
     ),
     ServiceError(ErrorKind.SESSION_EXISTS, 'session_id: "crossing-4" is open already'),
     ServiceError(

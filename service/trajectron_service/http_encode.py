@@ -34,6 +34,7 @@ def forecast_json(forecast: Forecast) -> dict[str, Any]:
         "reference_time": forecast.reference_time,
         "time_offsets_s": forecast.time_offsets_s,
         "sample_semantics": forecast.sample_semantics,
+        "mode_probability_floor": forecast.mode_probability_floor,
         "agents": [_agent_json(agent) for agent in forecast.agents],
     }
 

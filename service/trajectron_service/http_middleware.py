@@ -15,6 +15,7 @@ from trajectron_service import logs
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.http_errors import problem_response
 from trajectron_service.metrics import Metrics
+from trajectron_service.tracing import CARRIED, TRACEPARENT, Call
 
 REQUEST_ID = "X-Request-Id"
 # Probes and scrapes come all the time and say nothing.
@@ -47,7 +48,9 @@ class RequestMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        sender = _Sender(send, _request_id(scope))
+        carried = {name: value for name in CARRIED if (value := Headers(scope=scope).get(name))}
+        call = self._metrics.tracing.call("http", scope["method"], carried)
+        sender = _Sender(send, _request_id(scope), call.traceparent)
         start = time.perf_counter()
         with bound_contextvars(request_id=sender.request_id):
             try:
@@ -59,13 +62,14 @@ class RequestMiddleware:
                 log.exception("fault", protocol="http", path=scope["path"])
                 await sender.fail(scope, receive, _FAULT)
             finally:
-                self._note(scope, sender.status, time.perf_counter() - start)
+                self._note(scope, sender.status, time.perf_counter() - start, call)
 
-    def _note(self, scope: Scope, status: int, duration_s: float) -> None:
+    def _note(self, scope: Scope, status: int, duration_s: float, call: Call) -> None:
         template = getattr(scope.get("route"), "path", "unknown")
         verb = scope["method"] if scope["method"] in _VERBS else "other"
         method = f"{verb} {template}"
         self._metrics.request("http", method, str(status), duration_s)
+        call.end(method, str(status), failed=status >= 500)
         if template not in _QUIET:
             log.info(
                 "call",
@@ -80,17 +84,21 @@ class RequestMiddleware:
 class _Sender:
     """Sends an answer with the request's id, and remembers its status."""
 
-    def __init__(self, send: Send, request_id: str) -> None:
+    def __init__(self, send: Send, request_id: str, traceparent: str | None) -> None:
         self.request_id = request_id
         self.status = 499  # until an answer starts: the client has gone
         self._send = send
+        self._traceparent = traceparent
         self._started = False
 
     async def __call__(self, message: Message) -> None:
         if message["type"] == "http.response.start":
             self._started = True
             self.status = message["status"]
-            MutableHeaders(scope=message)[REQUEST_ID] = self.request_id
+            headers = MutableHeaders(scope=message)
+            headers[REQUEST_ID] = self.request_id
+            if self._traceparent is not None:
+                headers[TRACEPARENT] = self._traceparent
         await self._send(message)
 
     async def fail(self, scope: Scope, receive: Receive, error: ServiceError) -> None:

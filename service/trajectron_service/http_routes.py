@@ -47,6 +47,7 @@ def http_app(
         version: of the distribution, for the OpenAPI page.
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
+    app.state.metrics = metrics
     app.add_middleware(RequestMiddleware, metrics=metrics)
     app.add_exception_handler(ServiceError, http_errors.on_service_error)
     app.add_exception_handler(HTTPException, http_errors.on_http_exception)
@@ -114,7 +115,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Observe frames",
         operation_id="observe",
         response_model=answers.FrameResults,
-        responses={200: BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        responses={200: BINARY, **errors(400, 404, 409, 410, 413, 422, 429, 503, 504)},
         openapi_extra=takes(ObserveRequest),
     )
     router.add_api_route(
@@ -124,7 +125,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Predict from a session",
         operation_id="predict_session",
         response_model=answers.Forecast,
-        responses={200: BINARY, **errors(400, 404, 409, 413, 422, 429, 503, 504)},
+        responses={200: BINARY, **errors(400, 404, 409, 410, 413, 422, 429, 503, 504)},
         openapi_extra=takes(PredictSessionRequest, required=False),
     )
     router.add_api_route(
@@ -134,7 +135,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         summary="Get a session and its graph",
         operation_id="get_session",
         response_model=answers.SessionWithGraph,
-        responses={200: BINARY, **errors(404, 422)},
+        responses={200: BINARY, **errors(404, 410, 422, 503)},
     )
     router.add_api_route(
         "/v1/sessions/{session_id}",
@@ -143,7 +144,7 @@ def _sessions(api: HttpApi) -> APIRouter:
         status_code=204,
         summary="Delete a session",
         operation_id="delete_session",
-        responses=errors(404, 422),
+        responses=errors(404, 410, 422, 503),
     )
     return router
 

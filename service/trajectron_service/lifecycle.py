@@ -27,6 +27,7 @@ from trajectron_service.metrics import Metrics
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.stores import SessionStore
 from trajectron_service.stores.opening import open_store
+from trajectron_service.tracing import OFF, Tracing
 from trajectron_service.work import WorkInHand
 
 DISTRIBUTION = "trajectron-service"
@@ -89,23 +90,26 @@ async def _serve(settings: Settings) -> None:
 
 
 @asynccontextmanager
-async def running(settings: Settings) -> AsyncIterator[Service]:
+async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIterator[Service]:
     """The service, ready, on its ports; drained and stopped at the end of the block.
+
+    Args:
+        settings: of everything.
+        tracing: told of calls; as the settings say when None.
 
     Raises:
         SettingsError: a port is taken, or a model cannot be loaded.
         LeftBehindError: at the end, when the model was still at work after the grace.
     """
-    metrics = Metrics()
+    metrics = Metrics(tracing or _tracing(settings))
     metrics.build(version())
     health = Health(*SERVICES)
     await health.starting()
     async with AsyncExitStack() as stack:
+        stack.push_async_callback(asyncio.to_thread, metrics.tracing.close)
         with _port("http_port", settings.host, settings.http_port):
             listener = stack.enter_context(listen(settings.host, settings.http_port))
-        loaded = engine.load(
-            settings, lambda stage, seconds: metrics.stage_seconds.labels(stage).observe(seconds)
-        )
+        loaded = engine.load(settings, metrics.staged)
         work = WorkInHand(metrics)
         store = await open_store(settings, metrics)
         stack.push_async_callback(store.close)
@@ -139,6 +143,20 @@ async def running(settings: Settings) -> AsyncIterator[Service]:
         await health.ready()
         http_port = listener.getsockname()[1]
         yield Service(application, evaluations, health, metrics, store, http_port, grpc_port)
+
+
+def _tracing(settings: Settings) -> Tracing:
+    if settings.tracing == "off":
+        return OFF
+    try:
+        # Not everybody has installed it.
+        from trajectron_service import telemetry  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise SettingsError(
+            f"tracing: {settings.tracing!r} needs the package {error.name}; "
+            "install trajectron-service[service,tracing]"
+        ) from error
+    return telemetry.exporting(settings.tracing_endpoint, settings.tracing_share, version())
 
 
 async def _drain(

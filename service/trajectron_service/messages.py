@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectron_model.config import MODE_PROBABILITY_FLOOR
 from trajectron_service.errors import ServiceError
 
 Float32 = NDArray[np.float32]
@@ -211,6 +212,11 @@ class Forecast:
         """How samples go together: between agents always independent, within one as asked."""
         stratified = self.sampling is Sampling.STRATIFIED
         return "independent_agents_stratified" if stratified else "independent_agents"
+
+    @property
+    def mode_probability_floor(self) -> float:
+        """Modes that were less probable are left out: their probability is zero."""
+        return MODE_PROBABILITY_FLOOR if self.mode is ForecastMode.GMM else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
+import numpy as np
 from prometheus_client import (
     CollectorRegistry,
     Counter,
@@ -19,6 +20,11 @@ from prometheus_client import (
     generate_latest,
 )
 
+from trajectron_model.evaluation import metrics
+from trajectron_model.evaluation.densities import LEVELS
+from trajectron_model.evaluation.live import LiveScores
+from trajectron_service.tracing import OFF, Tracing
+
 # From a quarter of a millisecond to some seconds; 0.4 s is the usual model's step.
 SECONDS = (
     0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4,
@@ -27,15 +33,113 @@ SECONDS = (
 LONG_SECONDS = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
 SIZES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 AGENTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+METERS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 CONTENT_TYPE = "text/plain; version=1.0.0; charset=utf-8"
 
 Stage = Literal["decode", "queue", "encode", "sample", "serialise", "store"]
 
 
-class Metrics:
-    """What operators see. One object per application; safe to use from any thread."""
+class AccuracyMetrics:
+    """What forecasts of sessions scored when their future had come; see ``watching``.
 
-    def __init__(self) -> None:
+    Sums and counts by model and agent type, so that means over any time are a ratio of two
+    rates. ``step`` counts the model's steps from 1; ``point`` says which point forecast: the
+    mean of the most probable mode, or over all modes.
+    """
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        kind = ("model", "type")
+        self.ade = Histogram(
+            "trajectron_accuracy_ade_meters",
+            "Mean distance of a point forecast from the truth, over the steps that came.",
+            (*kind, "point"),
+            buckets=METERS,
+            registry=registry,
+        )
+        self.fde = Histogram(
+            "trajectron_accuracy_fde_meters",
+            "Distance of a point forecast from the truth at the last step that came.",
+            (*kind, "point"),
+            buckets=METERS,
+            registry=registry,
+        )
+        self.steps = Counter(
+            "trajectron_accuracy_steps",
+            "Agents scored at a step: what the sums by step are divided by.",
+            (*kind, "step"),
+            registry=registry,
+        )
+        self.displacement = Counter(
+            "trajectron_accuracy_displacement_meters",
+            "Sum of the distances of a point forecast from the truth at a step.",
+            (*kind, "point", "step"),
+            registry=registry,
+        )
+        self.nll = Counter(
+            "trajectron_accuracy_nll_nats",
+            "Sum of the sizes of the negative log likelihoods (of positions in metres, under the "
+            "whole mixture) at a step; those below zero apart, so that neither sum falls.",
+            (*kind, "step", "sign"),
+            registry=registry,
+        )
+        self.covered = Counter(
+            "trajectron_accuracy_covered",
+            "Agents that stood within the forecast's region of so many percent at a step.",
+            (*kind, "step", "region"),
+            registry=registry,
+        )
+        self.agents = Counter(
+            "trajectron_accuracy_agents",
+            "Agents' forecasts by what became of them: scored, unseen (none of the future came), "
+            "skipped (no budget), evicted (too many pending), failed.",
+            ("outcome",),
+            registry=registry,
+        )
+        self.pending = Gauge(
+            "trajectron_accuracy_pending_agents",
+            "Agents' forecasts that wait for their future.",
+            registry=registry,
+        )
+        self.seconds = Counter(
+            "trajectron_accuracy_seconds",
+            "Time that watching took: to draw mixtures, to read frames, to score.",
+            registry=registry,
+        )
+
+    def note(self, model: str, kind: str, scores: LiveScores) -> None:
+        """Adds the scores of some agents of one type."""
+        for point, distance in (("mode", scores.distance_mode_m), ("mean", scores.distance_mean_m)):
+            for ade in metrics.average_displacement(distance).tolist():
+                self.ade.labels(model, kind, point).observe(ade)
+            for fde in metrics.final_displacement(distance).tolist():
+                self.fde.labels(model, kind, point).observe(fde)
+            for step, total in enumerate(np.nansum(distance, axis=0).tolist(), start=1):
+                self.displacement.labels(model, kind, point, step).inc(total)
+        nll = np.nan_to_num(scores.nll_mixture)  # [A, H]
+        columns = zip(
+            (~np.isnan(scores.distance_mean_m)).sum(axis=0).tolist(),
+            np.maximum(nll, 0.0).sum(axis=0).tolist(),
+            np.maximum(-nll, 0.0).sum(axis=0).tolist(),
+            np.nansum(scores.covered, axis=1).T.tolist(),
+            strict=True,
+        )
+        for step, (count, above, below, covered) in enumerate(columns, start=1):
+            self.steps.labels(model, kind, step).inc(count)
+            self.nll.labels(model, kind, step, "positive").inc(above)
+            self.nll.labels(model, kind, step, "negative").inc(below)
+            for level, inside in zip(LEVELS, covered, strict=True):
+                self.covered.labels(model, kind, step, f"{100 * level:g}").inc(inside)
+
+
+class Metrics:
+    """What operators see. One object per application; safe to use from any thread.
+
+    Args:
+        tracing: told of the stages too; whoever has the metrics finds it here.
+    """
+
+    def __init__(self, tracing: Tracing = OFF) -> None:
+        self.tracing = tracing
         disable_created_metrics()  # when a series began is of no use, and doubles the output
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
@@ -93,6 +197,12 @@ class Metrics:
             ("kind",),
             registry=registry,
         )
+        self.inference_seconds = Counter(
+            "trajectron_inference_seconds",
+            "Time that batches took on the inference thread, watching left out.",
+            registry=registry,
+        )
+        self.accuracy = AccuracyMetrics(registry)
         self.conflicts = Counter(
             "trajectron_session_conflicts",
             "Changes of sessions done again because another replica was faster.",
@@ -184,9 +294,15 @@ class Metrics:
         """Times the block as one stage."""
         start = time.perf_counter()
         try:
-            yield
+            with self.tracing.stage(stage):
+                yield
         finally:
             self.stage_seconds.labels(stage).observe(time.perf_counter() - start)
+
+    def staged(self, stage: Stage, seconds: float) -> None:
+        """Notes a stage of a batch that has just ended, on the inference thread."""
+        self.stage_seconds.labels(stage).observe(seconds)
+        self.tracing.staged(stage, seconds)
 
     def render(self) -> bytes:
         """All metrics in the Prometheus text format (``CONTENT_TYPE``)."""

@@ -12,6 +12,7 @@ from typing import NewType, Protocol
 
 from trajectron_service.messages import AgentForecast, ForecastMode, ModelInfo, Sampling, SceneGraph
 from trajectron_service.timebase import Head, Step
+from trajectron_service.tracing import Ticket
 
 State = NewType("State", object)
 # Live states, or the bytes that the engine packed them into.
@@ -52,6 +53,7 @@ class SceneJob:
     """Work on one scene: steps in order, then forecasts from states before or after them.
 
     ``serials`` names ``states`` (also when they are bytes); ``keep`` the states wanted back.
+    ``ticket`` says to tracing whose work it is.
     """
 
     model: str
@@ -62,6 +64,7 @@ class SceneJob:
     forecasts: tuple[ForecastTask, ...] = ()
     graph: Head | None = None
     pack: bool = False
+    ticket: Ticket | None = None
 
 
 @dataclass(frozen=True, eq=False)

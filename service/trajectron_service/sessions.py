@@ -31,12 +31,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
-from trajectron_service import logs, records
 from trajectron_service.errors import ErrorKind, ServiceError
+from trajectron_service.kept_records import KeptRecords
 from trajectron_service.messages import SessionInfo
 from trajectron_service.metrics import Metrics
-from trajectron_service.records import RecordError, SceneRecord, UnknownFormatError
-from trajectron_service.session_errors import DAMAGED, DELETED, IDLE, LOST, gone, store_faults
+from trajectron_service.records import SceneRecord
+from trajectron_service.session_errors import DELETED, store_faults
 from trajectron_service.stores import (
     Closure,
     Creation,
@@ -45,18 +45,14 @@ from trajectron_service.stores import (
     SessionStore,
     StoredSession,
     StoreError,
-    new_revision,
 )
 from trajectron_service.validation import quoted
-
-log = logs.get(__name__)
 
 ResultT = TypeVar("ResultT")
 
 _WRITE_ATTEMPTS = 5
 _REAP_AT_ONCE = 1000
 _RETRY_AFTER_FULL_S = 5.0
-_LONGEST_SLACK_S = 30.0
 # A session that a stream holds is kept open for at least so long at a time.
 _HELD_S = 5.0
 
@@ -72,7 +68,8 @@ class Change(NamedTuple):
 class _Live:
     """A session in use. ``record`` is None until it is read from the store.
 
-    ``revision`` is the store's, as far as known here; ``stored_expiry`` is when it closes there.
+    ``revision`` is the store's, as far as known here; ``stored_expiry`` is when it closes there;
+    ``idle_timeout_s`` is known once a record was.
     """
 
     key: SessionKey
@@ -80,6 +77,7 @@ class _Live:
     record: SceneRecord | None = None
     revision: str = ""
     stored_expiry: float = 0.0
+    idle_timeout_s: float = 0.0
     users: int = 0
     holds: int = 0
     closed: bool = False
@@ -96,6 +94,7 @@ class Sessions:
         metrics: told about sessions, agents and edges.
         max_sessions: more are refused.
         park_after_s: unused for longer, a session is kept as bytes only.
+        on_close: told which session has been closed for good.
     """
 
     def __init__(
@@ -107,13 +106,16 @@ class Sessions:
         metrics: Metrics,
         max_sessions: int,
         park_after_s: float,
+        on_close: Callable[[SessionKey], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._pack = pack
         self._clock = clock
         self._metrics = metrics
+        self._kept = KeptRecords(store, clock, metrics)
         self._quota = Quota(max_sessions)
         self._park_after_s = park_after_s
+        self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
         self._locks: weakref.WeakValueDictionary[SessionKey, asyncio.Lock] = (
             weakref.WeakValueDictionary()
@@ -132,7 +134,7 @@ class Sessions:
         """
         now = self._clock()
         expires_at = now + record.idle_timeout_s
-        stored = self._stored(record, b"", expires_at)
+        stored = self._kept.stored(record, b"", expires_at)
         with store_faults():
             made = await self._create(_Live(key, expires_at, record), stored)
             if made in (Creation.FULL, Creation.TENANT_FULL):
@@ -149,7 +151,7 @@ class Sessions:
                     "close one or try again later",
                     retry_after_s=_RETRY_AFTER_FULL_S,
                 )
-            await self._count()
+            await self._kept.count()
         return record.info(key.id, expires_at)
 
     async def change(
@@ -210,10 +212,14 @@ class Sessions:
                     raise
         else:
             in_use = live is not None and (live.users or live.holds)
-            if stored is None or (stored.expires_at <= self._clock() and not in_use):
-                raise await self._gone(key)
+            now = self._clock()
+            if stored is not None and stored.expires_at <= now and not in_use:
+                await self._evict(key, self._kept.idle(), expired_by=now)
+                stored = None
+            if stored is None:
+                raise await self._kept.gone(key)
             if not known or (live and live.revision != stored.revision and not live.users):
-                record = await self._decoded(key, stored)
+                record = await self._kept.decoded(key, stored)
                 return record.info(key.id, stored.expires_at)
         assert live is not None  # known
         assert live.record is not None
@@ -244,10 +250,10 @@ class Sessions:
         live = self._live.get(key)
         busy = live is not None and (live.users > 0 or live.holds > 0)
         with store_faults():
-            if not busy and await self._evict(key, self._idle(), expired_by=self._clock()):
-                raise await self._gone(key)
-            if not await self._evict(key, self._closure(reason)):
-                raise await self._gone(key)
+            if not busy and await self._evict(key, self._kept.idle(), expired_by=self._clock()):
+                raise await self._kept.gone(key)
+            if not await self._evict(key, self._kept.closure(reason)):
+                raise await self._kept.gone(key)
 
     @contextmanager
     def held(self, key: SessionKey) -> Iterator[None]:
@@ -266,12 +272,17 @@ class Sessions:
         """Keeps the sessions open that are held."""
         now = self._clock()
         for live in [live for live in self._live.values() if live.holds]:
-            idle_s = live.record.idle_timeout_s if live.record else 0.0
-            # Read first where it is parked; a busy one is kept open by what it does.
-            if live.users or (live.record and live.stored_expiry > now + max(idle_s / 2, _HELD_S)):
+            idle_s = live.idle_timeout_s
+            # A busy one is kept open by what it does.
+            if live.users or live.stored_expiry > now + max(idle_s / 2, _HELD_S):
                 continue
-            with suppress(ServiceError):  # gone: whoever holds it is told when it is used
-                await self.change(live.key, _looked_at)
+            if not idle_s:
+                with suppress(ServiceError):  # gone: whoever holds it is told when it is used
+                    await self.change(live.key, _looked_at)
+                continue
+            live.expires_at = now + idle_s
+            if not await self._touch(live, live.expires_at, self._kept.slack_s(idle_s)):
+                self._close(live)
 
     async def reap(self) -> int:
         """Closes the sessions that have expired; how many. One in use is left alone."""
@@ -281,7 +292,7 @@ class Sessions:
             live = self._live.get(key)
             if live is None or not (live.users or live.holds):
                 idle_s = live.record.idle_timeout_s if live and live.record else None
-                closed += await self._evict(key, self._idle(idle_s), expired_by=now)
+                closed += await self._evict(key, self._kept.idle(idle_s), expired_by=now)
         return closed
 
     async def park(self) -> int:
@@ -304,7 +315,7 @@ class Sessions:
         async with self._lock(live.key):
             made = await self._store.create(live.key, stored, self._quota)
             if made is Creation.TAKEN:
-                idle = self._idle()
+                idle = self._kept.idle()
                 if await self._remove(live.key, idle, expired_by=idle.at):
                     made = await self._store.create(live.key, stored, self._quota)
             if made is Creation.CREATED:
@@ -341,7 +352,7 @@ class Sessions:
         With ``fresh`` a store that other replicas use is asked whether the record is the newest.
         """
         if live.closed:
-            raise await self._gone(live.key)
+            raise await self._kept.gone(live.key)
         now = self._clock()
         # Whoever came before expiry holds the session open for those in line behind.
         expired = live.users == 1 and not live.holds and live.expires_at <= now
@@ -355,44 +366,23 @@ class Sessions:
             return live.record  # as far as is known here
         if stored is None or live.closed:
             self._close(live)
-            raise await self._gone(live.key, lost=bool(live.revision) and stored is None)
+            raise await self._kept.gone(live.key, lost=bool(live.revision) and stored is None)
         if expired and stored.expires_at <= now:
             idle_s = None if live.record is None else live.record.idle_timeout_s
-            await self._evict(live.key, self._idle(idle_s), expired_by=now)
+            await self._evict(live.key, self._kept.idle(idle_s), expired_by=now)
             self._close(live)
-            raise await self._gone(live.key)
+            raise await self._kept.gone(live.key)
         if live.record is None or stored.revision != live.revision:
-            self._show(live, await self._decoded(live.key, stored))
+            self._show(live, await self._kept.decoded(live.key, stored))
         live.revision, live.stored_expiry = stored.revision, stored.expires_at
         assert live.record is not None  # shown above
         return live.record
-
-    async def _decoded(self, key: SessionKey, stored: StoredSession) -> SceneRecord:
-        """The record in the bytes; bytes that are none are set aside, and said to be."""
-        try:
-            return records.decode(stored.data)
-        except UnknownFormatError as error:
-            # Another version of the service reads it, so it stays where it is.
-            raise ServiceError(
-                ErrorKind.STORE_UNAVAILABLE,
-                f"session_id: {quoted(key.id)} was stored by another version of the service: "
-                f"{error}",
-                retry_after_s=_RETRY_AFTER_FULL_S,
-            ) from error
-        except RecordError as error:
-            why = self._closure(DAMAGED, str(error))
-            if await self._store.quarantine(key, stored.revision, why):
-                log.exception("session set aside", session=key.id)
-                self._metrics.evictions.labels(DAMAGED).inc()
-                self._metrics.quarantined.set(await self._store.quarantined())
-                await self._count()
-            raise gone(key, why) from error
 
     async def _put(self, live: _Live, before: SceneRecord, change: Change) -> bool:
         """Puts a record in place; False when another replica has put one."""
         after = change.record
         if live.closed:
-            raise await self._gone(live.key)
+            raise await self._kept.gone(live.key)
         expires_at = self._clock() + after.idle_timeout_s
         changed = (after.version, after.last_sequence) != (before.version, before.last_sequence)
         if self._store.durable and changed:
@@ -400,10 +390,10 @@ class Sessions:
             if not await self._write(live, after, packed, expires_at):
                 self._show(live, None)
                 return False
-        elif not await self._touch(live, expires_at, self._slack_s(after)):
+        elif not await self._touch(live, expires_at, self._kept.slack_s(after.idle_timeout_s)):
             self._close(live)
         if live.closed:
-            raise await self._gone(live.key)
+            raise await self._kept.gone(live.key)
         live.expires_at = expires_at
         self._show(live, after)
         return True
@@ -423,19 +413,11 @@ class Sessions:
         self, live: _Live, record: SceneRecord, packed: bytes, expires_at: float
     ) -> bool:
         with self._metrics.stage("store"):
-            stored = self._stored(record, packed, expires_at)
+            stored = self._kept.stored(record, packed, expires_at)
             if not await self._store.write(live.key, stored, live.revision):
                 return False
         live.revision, live.stored_expiry = stored.revision, stored.expires_at
         return True
-
-    def _stored(self, record: SceneRecord, packed: bytes, expires_at: float) -> StoredSession:
-        data = records.encode(record, packed)
-        return StoredSession(new_revision(), expires_at + self._slack_s(record), data)
-
-    def _slack_s(self, record: SceneRecord) -> float:
-        """How much later than it must the store may close a session, so that it is told less."""
-        return min(_LONGEST_SLACK_S, record.idle_timeout_s / 20) if self._store.durable else 0.0
 
     async def _park(self, live: _Live) -> bool:
         if live.users or live.closed:
@@ -456,24 +438,6 @@ class Sessions:
         self._metrics.parked.inc()
         return True
 
-    def _closure(self, reason: str, detail: str = "") -> Closure:
-        return Closure(reason, self._clock(), detail, new_revision())
-
-    def _idle(self, idle_timeout_s: float | None = None) -> Closure:
-        detail = "" if idle_timeout_s is None else f"{idle_timeout_s:g} s unused"
-        return self._closure(IDLE, detail)
-
-    async def _gone(self, key: SessionKey, *, lost: bool = False) -> ServiceError:
-        """The error for a session that the store has not; ``lost``: though it was here before."""
-        closure = None
-        with suppress(StoreError):
-            closure = await self._store.closure(key)
-            if closure is None and lost:
-                log.error("session lost by the store", session=key.id)
-                self._metrics.evictions.labels(LOST).inc()
-                closure = self._closure(LOST, "its data is gone, and nobody closed it")
-        return gone(key, closure)
-
     async def _evict(
         self, key: SessionKey, closure: Closure, expired_by: float | None = None
     ) -> bool:
@@ -491,7 +455,8 @@ class Sessions:
             if live is not None:
                 self._close(live)
         self._metrics.evictions.labels(closure.reason).inc()
-        await self._count()
+        self._on_close(key)
+        await self._kept.count()
         return True
 
     def _close(self, live: _Live) -> None:
@@ -508,9 +473,8 @@ class Sessions:
         self._metrics.agents.inc(agents)
         self._metrics.edges.inc(edges)
         live.record = record
-
-    async def _count(self) -> None:
-        self._metrics.sessions.set(await self._store.count())
+        if record is not None:
+            live.idle_timeout_s = record.idle_timeout_s
 
 
 async def _looked_at(record: SceneRecord) -> tuple[Change, None]:

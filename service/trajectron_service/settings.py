@@ -102,6 +102,20 @@ class Settings(BaseSettings):
     store_timeout_s: Seconds = Field(5.0, description="Time for one operation of the store.")
     drain_grace_s: Seconds = Field(20.0, description="Time for work in hand after SIGTERM.")
 
+    live_accuracy: bool = Field(
+        True, description="Score forecasts of sessions when their future arrives."
+    )
+    live_accuracy_budget: float = Field(
+        0.03,
+        gt=0.0,
+        le=1000.0,
+        description="Share of inference time that this may take; of forecasts beyond it none is "
+        "scored. Far more than 1: all are.",
+    )
+    live_accuracy_pending: Count = Field(
+        2048, description="Agents whose forecasts may wait for their future, about 12 kB each."
+    )
+
     data: Path | None = Field(
         None,
         description="Folder of the ETH/UCY recordings with their `splits.json`, or its parent; "
@@ -120,6 +134,16 @@ class Settings(BaseSettings):
         "idle",
         description="Of evaluations beside forecasts. `idle`: they run where nothing else wants "
         "to; `low`: at the lowest nice value.",
+    )
+
+    tracing: Literal["off", "otlp"] = Field(
+        "off", description="Where spans of requests go; `otlp` needs the extra `tracing`."
+    )
+    tracing_endpoint: str = Field(
+        "http://127.0.0.1:4318", description="Collector of spans: OTLP over HTTP."
+    )
+    tracing_share: float = Field(
+        1.0, ge=0.0, le=1.0, description="Share of traces kept where the client does not say."
     )
 
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Level.")

@@ -81,6 +81,9 @@ def test_a_forecast_arrives_whole_and_in_absolute_positions(carry: Carrier) -> N
         2**63 - 1,
     )
     assert got.sample_semantics == "independent_agents"
+    assert got.mode_probability_floor == sent.mode_probability_floor == 0.0
+    analytic = dataclasses.replace(sent, mode=core.ForecastMode.GMM)
+    assert carry(analytic).mode_probability_floor == analytic.mode_probability_floor > 0.0
     np.testing.assert_allclose(got.times, [10.4, 10.8, 11.2, 11.6])
     agent, source = got["7"], sent.agents[0]
     assert agent.last_observed_time == 9.6

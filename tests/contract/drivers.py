@@ -307,6 +307,7 @@ def forecast_view(message: pb.Forecast) -> Json:
         "sample_semantics": pb.SampleSemantics.Name(message.sample_semantics)
         .removeprefix("SAMPLE_SEMANTICS_")
         .lower(),
+        "mode_probability_floor": message.mode_probability_floor,
         "agents": [_agent_view(agent) for agent in message.agents],
     }
 

@@ -11,6 +11,7 @@ from tests.contract.drivers import CODES, Driver, RefusalError
 from tests.contract.scenes import DT_S, agent, frame, walking
 
 from trajectron_model import kernels
+from trajectron_model.config import MODE_PROBABILITY_FLOOR
 
 pytestmark = pytest.mark.asyncio(loop_scope="session")
 
@@ -61,6 +62,9 @@ async def test_positions_are_absolute_where_they_are_shown(driver: Driver) -> No
 
 async def test_gmm_has_modes_and_no_samples(driver: Driver) -> None:
     forecast = await driver.predict(walking(), mode="gmm", horizon=6)
+    assert forecast["mode_probability_floor"] == MODE_PROBABILITY_FLOOR
+    sampled = await driver.predict(walking(), num_samples=1, include_modes=True)
+    assert sampled["mode_probability_floor"] == 0.0
     for shown in forecast["agents"]:
         assert shown["mean"].shape[1:] == (6, 2)
         assert shown["samples"] is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -372,3 +373,15 @@ async def test_a_session_reads_frames_faster_than_the_model_steps(driver: Driver
         assert forecast["time_offsets_s"][0] == pytest.approx(DT_S)
         [one] = forecast["agents"]
         assert (one["x"], one["last_observed_time"]) == pytest.approx((1.5, 1.2))
+
+
+async def test_a_client_is_told_what_became_of_its_session(driver: Driver) -> None:
+    await driver.create_session("told-deleted")
+    await driver.delete_session("told-deleted")
+    await driver.create_session("told-idle", idle_timeout_s=0.05)
+    await asyncio.sleep(0.1)
+    for name, words in (("told-deleted", "was deleted at 2"), ("told-idle", "want of use at 2")):
+        with pytest.raises(RefusalError) as caught:
+            await driver.get_session(name)
+        assert caught.value.kind == "UNKNOWN_SESSION"
+        assert words in caught.value.message

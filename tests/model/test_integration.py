@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from trajectron_model.integration import RandomWalk, integrate, limit_speed
+from trajectron_model.integration import integrate, limit_speed, walk
 
 
 def test_integrating_true_velocities_gives_true_positions() -> None:
@@ -29,8 +29,7 @@ def test_position_covariance_is_that_of_a_random_walk_in_velocity() -> None:
     noise = torch.randn(count, steps, 2, generator=torch.Generator().manual_seed(0)) @ factor.T
     position = integrate(noise.cumsum(dim=1), dt)
     increment = (factor @ factor.T)[[0, 0, 1], [0, 1, 1]]
-    walk = RandomWalk(dt, increment)
-    for step in range(steps):
-        expected = walk.step(increment)
+    moments = walk(increment.expand(steps, 3), dt)
+    for step, expected in enumerate(moments):
         found = position[:, step].T.cov()[[0, 0, 1], [0, 1, 1]]
         torch.testing.assert_close(found, expected, rtol=0.02, atol=1e-4)

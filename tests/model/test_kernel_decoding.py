@@ -91,9 +91,10 @@ def test_samples_are_torchs(name: str, shape: tuple[int, int, int]) -> None:
 def test_moments_are_torchs(name: str, agents: int, horizon: int) -> None:
     asked = case(name, agents)
     with torch.inference_mode():
-        ours = asked.decoder.moments(asked.prepared, horizon, LIMIT)
+        every = asked.decoder.every_latent(agents)
+        ours = asked.decoder.moments(asked.prepared, *every, horizon, LIMIT)
         with by_torch():
-            theirs = asked.decoder.moments(asked.prepared, horizon, LIMIT)
+            theirs = asked.decoder.moments(asked.prepared, *every, horizon, LIMIT)
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
@@ -134,10 +135,11 @@ def test_moments_are_the_same_to_the_last_bit_whatever_stands_beside_them() -> N
     asked = case("default", agents=6)
     decoder = asked.decoder
     with torch.inference_mode():
-        everything = decoder.moments(asked.prepared, 5, LIMIT)
+        everything = decoder.moments(asked.prepared, *decoder.every_latent(6), 5, LIMIT)
         alone = Prepared(*(column[2:3] for column in asked.prepared))
         values = decoder.gates_latent.num_embeddings
-        for one, all_ in zip(decoder.moments(alone, 5, LIMIT), everything, strict=True):
+        found = decoder.moments(alone, *decoder.every_latent(1), 5, LIMIT)
+        for one, all_ in zip(found, everything, strict=True):
             assert torch.equal(one, all_[2 * values : 3 * values])
 
 

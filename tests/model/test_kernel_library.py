@@ -14,6 +14,7 @@ import torch
 
 from trajectron_model.kernels import build, in_use, kernels, loading
 from trajectron_model.kernels.dense import linear
+from trajectron_model.kernels.threads import share, torch_alone
 
 ROOT = Path(__file__).parents[2]
 
@@ -135,6 +136,36 @@ def test_weights_are_packed_again_when_they_change() -> None:
         torch.testing.assert_close(linear(layer, inputs), before + 1.0)
         layer.weight = torch.nn.Parameter(torch.zeros(4, 3))
         torch.testing.assert_close(linear(layer, inputs)[0], layer.bias)
+
+
+@needs_kernels
+def test_torch_is_kept_to_one_thread_around_kernels_and_set_back() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        shares: list[tuple[int, int]] = []
+        with torch_alone():
+            assert torch.get_num_threads() == 1
+            share(10, 1, lambda first, last: shares.append((first, last)))
+        assert torch.get_num_threads() == 3
+        assert sorted(shares) == [(0, 3), (3, 6), (6, 10)]
+    finally:
+        torch.set_num_threads(before)
+
+
+@needs_kernels
+def test_a_fault_in_any_part_of_shared_work_is_told() -> None:
+    def work(first: int, _last: int) -> None:
+        if first > 0:
+            raise RuntimeError("a part failed")
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(RuntimeError, match="a part failed"):
+            share(10, 1, work)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_gradients_flow_where_they_are_asked_for() -> None:

@@ -10,6 +10,7 @@ from contextlib import aclosing
 import pytest
 from tests.service.building import (
     QUICK,
+    Clock,
     application,
     config,
     frame,
@@ -364,3 +365,23 @@ async def test_an_outbox_for_the_latest_holds_one_forecast(app: Application) -> 
     assert [one and (one.sequence, one.superseded) for one in got] == [
         (1, True), (2, False), (3, True), (4, False)
     ]  # fmt: skip
+
+
+async def test_a_stream_that_is_silent_keeps_its_session_open(network: Trajectron) -> None:
+    clock = Clock()
+    app = application(network, clock=clock, idle_timeout_s=60.0)
+    sender = Sender()
+    stream = await app.open_stream("quiet", config(), RESULTS_ONLY)
+    async with aclosing(stream.replies(sender.frames())) as replies:
+        sender.send(1, walk([0])[0])
+        await next_reply(replies)
+        for _ in range(10):
+            clock.now += 30.0
+            await app.keep_house()
+        sender.send(2, walk([1])[0])
+        assert (await next_reply(replies)).result.version == 2
+    clock.now += 60.0
+    await app.keep_house()
+    with pytest.raises(ServiceError, match="for want of use"):
+        await app.get_session("quiet")
+    await app.close()

@@ -105,6 +105,8 @@ class Forecast:
         sample_semantics: how samples go together: those of different agents are independent of
             each other given the histories; those of one agent are independent
             (``"independent_agents"``) or stratified (``"independent_agents_stratified"``).
+        mode_probability_floor: modes that were less probable are left out: their probability
+            is zero, and their mean and covariance repeat the most probable mode's.
     """
 
     model: str
@@ -115,6 +117,7 @@ class Forecast:
     time_offsets_s: Float64
     agents: tuple[AgentForecast, ...]
     sample_semantics: str
+    mode_probability_floor: float = 0.0
 
     @property
     def times(self) -> Float64:

@@ -58,6 +58,7 @@ def to_forecast(body: Json) -> Forecast:
         time_offsets_s=np.array(body["time_offsets_s"], dtype=np.float64),
         agents=tuple(_agent_forecast(agent) for agent in body["agents"]),
         sample_semantics=body["sample_semantics"],
+        mode_probability_floor=body.get("mode_probability_floor", 0.0),
     )
 
 

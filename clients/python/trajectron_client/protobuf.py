@@ -101,6 +101,7 @@ def to_forecast(message: pb.Forecast) -> Forecast:
         time_offsets_s=np.array(message.time_offsets_s, dtype=np.float64),
         agents=tuple(_agent_forecast(agent) for agent in message.agents),
         sample_semantics=semantics.removeprefix("SAMPLE_SEMANTICS_").lower(),
+        mode_probability_floor=message.mode_probability_floor,
     )
 
 

@@ -7,6 +7,6 @@ tells how to add one.
 
 from __future__ import annotations
 
-from trajectron_model.kernels.loading import Kernels, in_use, kernels
+from trajectron_model.kernels.loading import Kernels, in_use, kernels, without
 
-__all__ = ["Kernels", "in_use", "kernels"]
+__all__ = ["Kernels", "in_use", "kernels", "without"]

@@ -8,11 +8,11 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from trajectron_model.kernels.loading import Kernels
 from trajectron_model.kernels.packing import (
@@ -90,7 +90,7 @@ def sample(
     limit: float,
 ) -> Tensor | None:
     """``Decoder.sample`` by the kernel; None where torch has to do it."""
-    library = library_for(decoder, *prepared, uniform, normal)
+    library = library_for(decoder.head.weight, *prepared, uniform, normal)
     if library is None:
         return None
     rows, horizon = uniform.shape
@@ -108,7 +108,7 @@ def moments(
     decoder: Decoder, prepared: Prepared, agent: Tensor, latent: Tensor, horizon: int, limit: float
 ) -> tuple[Tensor, Tensor] | None:
     """``Decoder.moments`` by the kernel; None where torch has to do it."""
-    library = library_for(decoder, *prepared)
+    library = library_for(decoder.head.weight, *prepared)
     if library is None:
         return None
     means = prepared.velocity.new_empty(len(agent), horizon, 2)
@@ -175,8 +175,18 @@ def _pointer(tensor: Tensor) -> ctypes.c_void_p:
     return ctypes.c_void_p(tensor.data_ptr())
 
 
-def _pack(module: nn.Module, library: Kernels) -> _Packed:
-    decoder, lanes = cast("Decoder", module), library.lanes
+def _weights(decoder: Decoder) -> tuple[Tensor, ...]:
+    return (
+        decoder.recurrent.weight,
+        decoder.gates_latent.weight,
+        decoder.start_latent.weight,
+        decoder.head.weight,
+        decoder.head.bias,
+    )
+
+
+def _pack(decoder: Decoder, library: Kernels) -> _Packed:
+    lanes = library.lanes
     size, components = decoder.size, decoder.components
     units, many = _up(size, lanes), _up(components, lanes)
     logits = _up(components, _LOGIT_VECTORS * lanes)
@@ -246,4 +256,4 @@ def _up(number: int, step: int) -> int:
     return -(-number // step) * step
 
 
-_PACKED = PackedWeights(_pack)
+_PACKED: PackedWeights[Decoder, _Packed] = PackedWeights(_weights, _pack)

@@ -24,7 +24,7 @@ class _Dense:
 
 def linear(layer: nn.Linear, inputs: Tensor) -> Tensor:
     """``layer(inputs)`` for inputs [N, depth]; by torch where kernels cannot."""
-    library = library_for(layer, inputs)
+    library = library_for(layer.weight, inputs)
     if library is None:
         outputs: Tensor = layer(inputs)
         return outputs
@@ -46,12 +46,16 @@ def linear(layer: nn.Linear, inputs: Tensor) -> Tensor:
     return out
 
 
-def _pack(layer: nn.Module, library: Kernels) -> _Dense:
-    assert isinstance(layer, nn.Linear)
+def _weights(layer: nn.Linear) -> tuple[Tensor, ...]:
+    given: Tensor | None = layer.bias
+    return (layer.weight,) if given is None else (layer.weight, given)
+
+
+def _pack(layer: nn.Linear, library: Kernels) -> _Dense:
     weight = layer.weight
     given: Tensor | None = layer.bias
     bias = weight.new_zeros(weight.shape[0]) if given is None else given
     return _Dense(panels(weight, library.lanes), padded(bias, library.lanes), weight.shape[0])
 
 
-_PACKED = PackedWeights(_pack)
+_PACKED = PackedWeights(_weights, _pack)

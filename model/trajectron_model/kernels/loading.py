@@ -6,6 +6,9 @@ import ctypes
 import functools
 import os
 import platform
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +16,9 @@ from trajectron_model.kernels import build
 
 SWITCH = "TRAJECTRON_KERNELS"
 """Environment variable: ``off`` does without kernels, a path names a library to take."""
+
+
+_here = threading.local()
 
 
 @dataclass(frozen=True)
@@ -41,8 +47,20 @@ class Unavailable:
 
 def kernels() -> Kernels | None:
     """The library for this processor, or None where torch does the work."""
+    if getattr(_here, "without", False):
+        return None
     found = _found()
     return found if isinstance(found, Kernels) else None
+
+
+@contextmanager
+def without() -> Iterator[None]:
+    """Torch does the work inside, in this thread: for comparing the two."""
+    _here.without = True
+    try:
+        yield
+    finally:
+        _here.without = False
 
 
 def in_use() -> str:

@@ -14,27 +14,34 @@ from trajectron_model.kernels.loading import Kernels, kernels
 PANEL_VECTORS = 4
 """As in simd.h."""
 
+Module = TypeVar("Module", bound=nn.Module)
 Packed = TypeVar("Packed")
 _Version = tuple[tuple[int, int], ...]
 
 
-class PackedWeights(Generic[Packed]):
+class PackedWeights(Generic[Module, Packed]):
     """What is made of a module's weights, made again once they have changed.
 
     A change is seen by where a weight lies and by torch's count of changes in place; writing
     through ``.data`` escapes both.
 
     Args:
+        weights: those that it is made of.
         pack: makes it, from a module and the library.
     """
 
-    def __init__(self, pack: Callable[[nn.Module, Kernels], Packed]) -> None:
+    def __init__(
+        self,
+        weights: Callable[[Module], tuple[Tensor, ...]],
+        pack: Callable[[Module, Kernels], Packed],
+    ) -> None:
+        self._weights = weights
         self._pack = pack
-        self._kept: WeakKeyDictionary[nn.Module, tuple[_Version, Packed]] = WeakKeyDictionary()
+        self._kept: WeakKeyDictionary[Module, tuple[_Version, Packed]] = WeakKeyDictionary()
 
-    def of(self, module: nn.Module, library: Kernels) -> Packed:
+    def of(self, module: Module, library: Kernels) -> Packed:
         """The module's weights, packed."""
-        version = tuple((p.data_ptr(), _changes(p)) for p in module.parameters())
+        version = tuple((w.data_ptr(), _changes(w)) for w in self._weights(module))
         kept = self._kept.get(module)
         if kept is None or kept[0] != version:
             kept = (version, self._pack(module, library))
@@ -46,16 +53,15 @@ def _changes(weight: Tensor) -> int:
     return 0 if weight.is_inference() else weight._version  # noqa: SLF001 -- torch's counter
 
 
-def library_for(module: nn.Module, *inputs: Tensor) -> Kernels | None:
-    """The library, if it can do the module's work on these inputs: None where torch must.
+def library_for(*tensors: Tensor) -> Kernels | None:
+    """The library, if it can work on these weights and inputs: None where torch must.
 
     Kernels compute values only (no gradients), in float32, on the processor.
     """
     library = kernels()
     if library is None or torch.is_grad_enabled():
         return None
-    tensors = (next(module.parameters()), *inputs)
-    fits = all(t.dtype is torch.float32 and t.device.type == "cpu" for t in tensors)
+    fits = all(t.dtype is torch.float32 and t.is_cpu for t in tensors)
     return library if fits else None
 
 

@@ -755,6 +755,7 @@ class Forecast(_message.Message):
     TIME_OFFSETS_S_FIELD_NUMBER: _builtins.int
     SAMPLE_SEMANTICS_FIELD_NUMBER: _builtins.int
     AGENTS_FIELD_NUMBER: _builtins.int
+    MODE_PROBABILITY_FLOOR_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     model_hash: _builtins.str
     """sha256 of the model's weights, hexadecimal."""
@@ -763,6 +764,11 @@ class Forecast(_message.Message):
     reference_time_s: _builtins.float
     """Of the frame that the forecast starts from, on the client's clock."""
     sample_semantics: Global___SampleSemantics.ValueType
+    mode_probability_floor: _builtins.float
+    """Modes that were less probable than this are left out: their probability is
+    zero, the others' sum to one, and their mean and covariance repeat the most
+    probable mode's. Above zero for FORECAST_MODE_GMM only.
+    """
     @_builtins.property
     def time_offsets_s(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """[H] after reference_time_s, the first greater than zero."""
@@ -780,10 +786,11 @@ class Forecast(_message.Message):
         time_offsets_s: _abc.Iterable[_builtins.float] | None = ...,
         sample_semantics: Global___SampleSemantics.ValueType = ...,
         agents: _abc.Iterable[Global___AgentForecast] | None = ...,
+        mode_probability_floor: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "mode", b"mode", "model", b"model", "model_hash", b"model_hash", "reference_time_s", b"reference_time_s", "sample_semantics", b"sample_semantics", "seed", b"seed", "time_offsets_s", b"time_offsets_s"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "mode", b"mode", "mode_probability_floor", b"mode_probability_floor", "model", b"model", "model_hash", b"model_hash", "reference_time_s", b"reference_time_s", "sample_semantics", b"sample_semantics", "seed", b"seed", "time_offsets_s", b"time_offsets_s"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

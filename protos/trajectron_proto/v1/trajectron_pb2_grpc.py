@@ -104,7 +104,9 @@ class TrajectronServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def GetSession(self, request, context):
-        """A session with its graph. NOT_FOUND when unknown, closed or expired.
+        """A session with its graph. NOT_FOUND when unknown, closed or expired, with what
+        became of it and when; DATA_LOSS when what is stored of it cannot be read.
+        Whatever needs the store is UNAVAILABLE while that is away.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

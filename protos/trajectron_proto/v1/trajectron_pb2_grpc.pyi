@@ -52,7 +52,10 @@ class TrajectronServiceStub:
     ALREADY_EXISTS when the id is taken; RESOURCE_EXHAUSTED at the session cap.
     """
     GetSession: _grpc.UnaryUnaryMultiCallable[_trajectron_pb2.GetSessionRequest, _trajectron_pb2.GetSessionResponse]
-    """A session with its graph. NOT_FOUND when unknown, closed or expired."""
+    """A session with its graph. NOT_FOUND when unknown, closed or expired, with what
+    became of it and when; DATA_LOSS when what is stored of it cannot be read.
+    Whatever needs the store is UNAVAILABLE while that is away.
+    """
     ListSessions: _grpc.UnaryUnaryMultiCallable[_trajectron_pb2.ListSessionsRequest, _trajectron_pb2.ListSessionsResponse]
     """Open sessions in order of id, a page at a time."""
     DeleteSession: _grpc.UnaryUnaryMultiCallable[_trajectron_pb2.DeleteSessionRequest, _trajectron_pb2.DeleteSessionResponse]
@@ -88,7 +91,10 @@ class TrajectronServiceAsyncStub(TrajectronServiceStub):
     ALREADY_EXISTS when the id is taken; RESOURCE_EXHAUSTED at the session cap.
     """
     GetSession: _aio.UnaryUnaryMultiCallable[_trajectron_pb2.GetSessionRequest, _trajectron_pb2.GetSessionResponse]  # type: ignore[assignment]
-    """A session with its graph. NOT_FOUND when unknown, closed or expired."""
+    """A session with its graph. NOT_FOUND when unknown, closed or expired, with what
+    became of it and when; DATA_LOSS when what is stored of it cannot be read.
+    Whatever needs the store is UNAVAILABLE while that is away.
+    """
     ListSessions: _aio.UnaryUnaryMultiCallable[_trajectron_pb2.ListSessionsRequest, _trajectron_pb2.ListSessionsResponse]  # type: ignore[assignment]
     """Open sessions in order of id, a page at a time."""
     DeleteSession: _aio.UnaryUnaryMultiCallable[_trajectron_pb2.DeleteSessionRequest, _trajectron_pb2.DeleteSessionResponse]  # type: ignore[assignment]
@@ -139,7 +145,10 @@ class TrajectronServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _trajectron_pb2.GetSessionRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_trajectron_pb2.GetSessionResponse, _abc.Awaitable[_trajectron_pb2.GetSessionResponse]]:
-        """A session with its graph. NOT_FOUND when unknown, closed or expired."""
+        """A session with its graph. NOT_FOUND when unknown, closed or expired, with what
+        became of it and when; DATA_LOSS when what is stored of it cannot be read.
+        Whatever needs the store is UNAVAILABLE while that is away.
+        """
 
     @_abc_1.abstractmethod
     def ListSessions(

@@ -78,7 +78,9 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
         caption="*: the default. ADE/FDE: best of 20 samples per agent, metres.",
         caption_justify="left",
     )
-    for column in ("model", "steps", "modes", "validation", "test", "sha256"):
+    # A name cut short on a narrow screen could be any of several.
+    table.add_column("model", no_wrap=True, min_width=max(len(info.name) for info in infos) + 1)
+    for column in ("steps", "modes", "validation", "test", "sha256"):
         table.add_column(column, no_wrap=True)
     for column in ("agents", "trained on"):
         table.add_column(column, min_width=14)

@@ -1,0 +1,1 @@
+"""Live accuracy: the service scores its own forecasts when the future arrives."""
