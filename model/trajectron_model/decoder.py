@@ -24,8 +24,10 @@ from trajectron_model.gmm import BivariateMixture, choose, correlated
 from trajectron_model.integration import limit_speed
 from trajectron_model.kernels import decoding
 from trajectron_model.kernels.dense import linear
+from trajectron_model.teacher_forcing import Bounds, hidden_states, mixture_log_prob
 
 _CORRELATION_BOUND = 0.98
+_SCALE_SHIFT = 1.0
 # Rows decoded at a time without gradients: the gates of a block stay in the processor's cache,
 # and memory is bounded however many rollouts are asked for.
 _BLOCK_ROWS = 1024
@@ -115,7 +117,7 @@ class Decoder(nn.Module):
     def components_of(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean change, scale and correlation of components from raw outputs [..., 5]."""
         span = self.log_sigma_max - self.log_sigma_min
-        scale = torch.exp(self.log_sigma_min + span * torch.sigmoid(raw[..., 2:4] - 1.0))
+        scale = torch.exp(self.log_sigma_min + span * torch.sigmoid(raw[..., 2:4] - _SCALE_SHIFT))
         return raw[..., :2], scale, _CORRELATION_BOUND * torch.tanh(raw[..., 4])
 
     def log_prob(self, start: Start, future: Tensor) -> Tensor:
@@ -125,15 +127,21 @@ class Decoder(nn.Module):
             start: R rollouts.
             future: [R, H, 2] velocities; the density is the unclipped one.
         """
-        h, c, velocity = start.hidden, start.cell, start.velocity
-        hidden = []
-        for t in range(future.shape[1]):
-            h, c = self.cell(start, velocity, h, c)
-            hidden.append(h)
-            velocity = future[:, t]
         previous = torch.cat([start.velocity.unsqueeze(1), future[:, :-1]], dim=1)
-        mixture = self.mixture(torch.stack(hidden, dim=1), previous)
-        return mixture.log_prob(future)
+        weight = self.recurrent.weight
+        hidden = hidden_states(start.gates, start.hidden, start.cell, previous, weight)
+        # By field instead of by component, as `mixture` has them.
+        change = self.head.weight.shape[0] - self.components
+        fields = torch.arange(change).reshape(self.components, 5).T.reshape(-1) + self.components
+        order = torch.cat([torch.arange(self.components), fields]).to(hidden.device)
+        log_prob = mixture_log_prob(
+            hidden.flatten(0, 1),
+            self.head.weight[order],
+            self.head.bias[order],
+            (future - previous).flatten(0, 1),
+            Bounds(self.log_sigma_min, self.log_sigma_max, _CORRELATION_BOUND, _SCALE_SHIFT),
+        )
+        return log_prob.reshape(future.shape[:2])
 
     def sample(
         self,

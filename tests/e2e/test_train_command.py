@@ -63,6 +63,24 @@ def test_a_training_goes_on_where_it_was(
     assert "begun with other settings" in capsys.readouterr().err
 
 
+def test_a_training_goes_on_from_weights(
+    tmp_path: Path, crowd: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert run("train", crowd, "--out", first, *FEW) == 0
+    onward = ("--learning-rate", "0.0005", "--average-steps", "2", "--start")
+    assert run("train", crowd, "--out", second, *FEW, *onward, first) == 0
+    told = registry.describe(second).provenance
+    assert told["settings"]["learning_rate"] == 0.0005 and told["settings"]["average_steps"] == 2
+    assert told["start"]["weights_sha256"] == registry.describe(first).weights_sha256
+    for start, reason in (
+        ("eth_ucy", "trained on other recordings"),
+        ("none", "neither a bundled"),
+    ):
+        assert run("train", crowd, "--out", second, *FEW, "--start", start) == 2
+        assert reason in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("row", "reason"),
     [

@@ -16,6 +16,7 @@ from trajectron_model.data.readers import read_apolloscape
 from trajectron_model.data.recording import Recording
 from trajectron_model.forecast import ForecastRequest
 from trajectron_model.training import resuming
+from trajectron_model.training.averaging import Average
 from trajectron_model.training.examples import Examples, ExampleSettings
 from trajectron_model.training.settings import TrainSettings, presets
 from trajectron_model.training.trainer import Progress, train
@@ -131,6 +132,81 @@ def test_a_save_that_is_cut_off_leaves_the_one_before(
     rest = run(tmp_path / "cut", resume=True)
     assert rest[0].step == 5
     assert Checkpoint.load(tmp_path / "cut").sha256 == Checkpoint.load(tmp_path / "whole").sha256
+
+
+def test_averaged_weights_are_kept_and_resumed(tmp_path: Path) -> None:
+    averaged = replace(QUICK, average_steps=5, calibrate=False)
+    run(tmp_path / "whole", averaged)
+
+    def stop_at_six(progress: Progress) -> None:
+        if progress.step == 6:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        train(
+            SMALL,
+            averaged,
+            [recording()],
+            [recording("judge", seed=1)],
+            tmp_path / "cut",
+            provenance={"task": "test"},
+            observe=stop_at_six,
+        )
+    run(tmp_path / "cut", averaged, resume=True)
+    run(tmp_path / "newest", replace(averaged, average_steps=0))
+    hashes = [Checkpoint.load(tmp_path / f).sha256 for f in ("whole", "cut", "newest")]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_an_average_is_the_plain_mean_at_first_and_forgets_then() -> None:
+    model = Trajectron(SMALL)
+    average = Average(model, 3)
+    weights = (6.0, 0.0, 3.0, 9.0)
+    expected = (6.0, 3.0, 3.0, 3.0 + (9.0 - 3.0) / 3.0)
+    for seen, (value, mean) in enumerate(zip(weights, expected, strict=True)):
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.fill_(value)
+        average.update(seen)
+        for parameter in average.model.parameters():
+            torch.testing.assert_close(parameter, torch.full_like(parameter, mean))
+
+
+def test_a_training_goes_on_from_given_weights_and_never_keeps_worse(tmp_path: Path) -> None:
+    bare = replace(QUICK, calibrate=False)
+    run(tmp_path / "first", bare)
+    start = Checkpoint.load(tmp_path / "first")
+    run(tmp_path / "hopeless", replace(bare, learning_rate=5.0), start=start)
+    kept = Checkpoint.load(tmp_path / "hopeless")
+    assert kept.description.weights_sha256 == start.description.weights_sha256
+    assert kept.provenance["selected"]["step"] == 0
+    assert kept.provenance["start"]["weights_sha256"] == start.description.weights_sha256
+    assert kept.provenance["start"]["settings"] == bare.to_json()
+
+
+def test_a_start_that_has_seen_other_recordings_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "first", replace(QUICK, steps=1, calibrate=False))
+    start = Checkpoint.load(tmp_path / "first")
+    with pytest.raises(ValueError, match="trained on other recordings: made"):
+        train(
+            SMALL,
+            QUICK,
+            [recording("secret")],
+            [recording("judge", seed=1)],
+            tmp_path / "second",
+            provenance={},
+            start=start,
+        )
+    with pytest.raises(ValueError, match="another configuration"):
+        train(
+            replace(SMALL, decoder_size=20),
+            QUICK,
+            [recording()],
+            [recording("judge", seed=1)],
+            tmp_path / "second",
+            provenance={},
+            start=start,
+        )
 
 
 def test_a_training_on_other_data_is_not_resumed(tmp_path: Path) -> None:

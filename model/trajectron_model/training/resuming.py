@@ -39,9 +39,17 @@ class Run:
         return replace(self, best_step=self.step, best_score=score)
 
 
-def save(folder: Path, model: Trajectron, optimiser: torch.optim.Optimizer, run: Run) -> None:
+def save(
+    folder: Path,
+    model: Trajectron,
+    average: Trajectron,
+    optimiser: torch.optim.Optimizer,
+    run: Run,
+) -> None:
     """Writes what ``load`` reads: one file, whole or not at all, so that nothing can be torn."""
     tensors = {f"model.{name}": value for name, value in model.state_dict().items()}
+    if average is not model:
+        tensors |= {f"average.{name}": value for name, value in average.state_dict().items()}
     for number, moments in optimiser.state_dict()["state"].items():
         for name, value in moments.items():
             tensors[f"optimiser.{number}.{name}"] = torch.as_tensor(value)
@@ -51,9 +59,13 @@ def save(folder: Path, model: Trajectron, optimiser: torch.optim.Optimizer, run:
 
 
 def load(
-    folder: Path, model: Trajectron, optimiser: torch.optim.Optimizer, identity: dict[str, Any]
+    folder: Path,
+    model: Trajectron,
+    average: Trajectron,
+    optimiser: torch.optim.Optimizer,
+    identity: dict[str, Any],
 ) -> Run:
-    """Puts model and optimiser where the training in ``folder`` stood.
+    """Puts model, averaged model and optimiser where the training in ``folder`` stood.
 
     Raises:
         ValueError: a training that was begun with other settings or data.
@@ -67,9 +79,9 @@ def load(
         raise CheckpointError(f"{folder}: no training to resume: {error}") from error
     if run.identity != json.loads(json.dumps(identity)):
         raise ValueError(f"{folder}: the training there was begun with other settings or data")
-    model.load_state_dict(
-        {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
-    )
+    model.load_state_dict(_part(tensors, "model."))
+    if average is not model:
+        average.load_state_dict(_part(tensors, "average."))
     moments: dict[int, dict[str, torch.Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimiser."):
@@ -78,3 +90,7 @@ def load(
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": moments, "param_groups": groups})
     return run
+
+
+def _part(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

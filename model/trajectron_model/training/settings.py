@@ -21,6 +21,8 @@ class TrainSettings:
         learning_rate: at its peak; it warms up and then falls to zero along a cosine.
         warm_up: share of the steps until the peak.
         clip_norm: bound on the gradient's norm.
+        average_steps: about how many steps the weights are averaged over, by an exponential
+            decay of 1 - 1 / n; the average is what is validated and kept. 0 averages nothing.
         validate_every: steps between validations; the best of them is kept.
         seed: of weights, examples and noise.
         threads: of torch; None leaves them as they are.
@@ -31,6 +33,7 @@ class TrainSettings:
     learning_rate: float = 2e-3
     warm_up: float = 0.1
     clip_norm: float = 1.0
+    average_steps: int = 0
     validate_every: int = 100
     seed: int = 0
     threads: int | None = None

@@ -16,6 +16,7 @@ from trajectron_model.config import ModelConfig
 from trajectron_model.data.recording import Recording
 from trajectron_model.features import WORLD_FEATURES, WorldFeatures
 from trajectron_model.training import resuming
+from trajectron_model.training.averaging import Average
 from trajectron_model.training.calibration import calibrated
 from trajectron_model.training.examples import Examples
 from trajectron_model.training.objective import LossTerms, loss_terms
@@ -60,6 +61,7 @@ def train(
     observe: Observer = lambda _: None,
     device: str | None = None,
     resume: bool = False,
+    start: Checkpoint | None = None,
 ) -> Checkpoint:
     """Trains a model and leaves the best one, by validation, in ``folder``.
 
@@ -74,13 +76,16 @@ def train(
         observe: called after every step.
         device: ``cpu`` or ``cuda``; by default CUDA where there is one.
         resume: go on with the training that ``folder`` holds.
+        start: weights to begin with instead of random ones. It is validated first, so that what
+            is kept is never worse than it; it must know no recording but those of ``training``.
 
     Returns:
         The checkpoint as saved.
 
     Raises:
         ValueError: data that do not fit the configuration, nothing to validate on, or a
-            training in ``folder`` that was begun with other settings or data.
+            training in ``folder`` that was begun with other settings or data, or a start that
+            is of another configuration or has seen other recordings.
         CheckpointError: a training to resume whose files are damaged.
     """
     if settings.threads is not None:
@@ -89,7 +94,10 @@ def train(
     model = Trajectron(config)
     if isinstance(model.features, WorldFeatures):
         _standardise(model.features, training, config)
+    if start is not None:
+        _begin_with(start, model, [r.provenance for r in training])
     model = model.to(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    average = Average(model, settings.average_steps)
     examples = Examples(training, config, settings.examples, settings.seed)
     judge = Validation(validation, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
@@ -98,32 +106,60 @@ def train(
         "training": {"recordings": [r.provenance for r in training]},
         "validation": {"recordings": [r.provenance for r in validation]},
     }
-    identity = {"model": config.to_json(), "train": settings.to_json(), **recordings}
+    origin = {} if start is None else {"start": _origin(start)}
+    identity = {"model": config.to_json(), "train": settings.to_json(), **origin, **recordings}
     run = resuming.Run(step=0, best_step=0, best_score=float("inf"), identity=identity)
     if resume:
-        run = resuming.load(folder, model, optimiser, identity)
-    facts = {
-        **provenance,
-        **recordings,
-        "settings": settings.to_json(),
-    }
+        run = resuming.load(folder, model, average.model, optimiser, identity)
+    facts = {**provenance, **recordings, "settings": settings.to_json(), **origin}
+
+    def judged(run: resuming.Run) -> tuple[resuming.Run, ValidationFigures]:
+        figures = judge.figures(average.model, settings.objective)
+        if figures.score < run.best_score:
+            run = run.with_best(figures.score)
+            selected = {"step": run.step, "validation_figures": figures._asdict()}
+            save(folder / CHECKPOINT_NAME, average.model, {**facts, "selected": selected})
+        resuming.save(folder, model, average.model, optimiser, run)
+        return run, figures
+
+    if start is not None and not resume:
+        run, _ = judged(run)
     model.train()
     while run.step < settings.steps:
         rate = settings.learning_rate_at(run.step)
         terms = _gradient_step(model, optimiser, examples, settings, run.step, rate)
+        average.update(run.step)
         run = run.after_step()
         figures = None
         if run.step % settings.validate_every == 0 or run.step == settings.steps:
-            figures = judge.figures(model, settings.objective)
-            if figures.score < run.best_score:
-                run = run.with_best(figures.score)
-                selected = {"step": run.step, "validation_figures": figures._asdict()}
-                save(folder / CHECKPOINT_NAME, model, {**facts, "selected": selected})
-            resuming.save(folder, model, optimiser, run)
+            run, figures = judged(run)
+            model.train()
         observe(Progress(run.step, rate, terms, figures, run.best_step))
     if not settings.calibrate:
         return Checkpoint.load(folder / CHECKPOINT_NAME)
     return _with_calibration(folder / CHECKPOINT_NAME, judge, device)
+
+
+def _begin_with(start: Checkpoint, model: Trajectron, training: list[dict[str, str]]) -> None:
+    """Copies weights whose own training saw none but the recordings of this one."""
+    seen = start.provenance["training"]["recordings"]
+    strange = [r["name"] for r in seen if r not in training]
+    if strange:
+        raise ValueError(f"{start.name} was trained on other recordings: {', '.join(strange)}")
+    try:
+        model.load_state_dict(start.model.state_dict())
+    except RuntimeError as error:
+        raise ValueError(f"{start.name} is of another configuration: {error}") from error
+
+
+def _origin(start: Checkpoint) -> dict[str, Any]:
+    """What the provenance says of the weights that a training begins with."""
+    told = {key: start.provenance.get(key) for key in ("settings", "selected", "start")}
+    return {
+        "name": start.name,
+        "weights_sha256": start.description.weights_sha256,
+        **{key: value for key, value in told.items() if value is not None},
+    }
 
 
 def _with_calibration(path: Path, judge: Validation, device: str | None) -> Checkpoint:

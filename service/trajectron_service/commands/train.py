@@ -77,6 +77,21 @@ def train(
     validate_every: Annotated[
         int | None, typer.Option(min=1, help="Steps between validations.")
     ] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option(min=0.0, help="At its peak; it ends at zero.")
+    ] = None,
+    average_steps: Annotated[
+        int | None,
+        typer.Option(min=0, help="Weights are averaged over about so many steps; 0: not at all."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|PATH",
+            help="A bundled model or a checkpoint to go on from instead of random weights, "
+            "trained on none but the same recordings.",
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the training that `--out` holds.")
     ] = False,
@@ -95,6 +110,7 @@ def train(
     """
     from tqdm import tqdm
 
+    from trajectron_model import registry
     from trajectron_model.training.log import TensorBoardLog
     from trajectron_model.training.settings import presets
     from trajectron_model.training.trainer import train as run
@@ -107,6 +123,8 @@ def train(
         settings,
         steps=steps or settings.steps,
         validate_every=validate_every or settings.validate_every,
+        learning_rate=learning_rate or settings.learning_rate,
+        average_steps=settings.average_steps if average_steps is None else average_steps,
         examples=replace(settings.examples, agents=agents or settings.examples.agents),
     )
     training, judged, task = _recordings(
@@ -134,6 +152,7 @@ def train(
                 observe=observe,
                 device=device,
                 resume=resume,
+                start=None if start is None else registry.load(start),
             )
         except ValueError as error:
             raise UsageError(str(error)) from error
