@@ -48,6 +48,8 @@ __all__ = ["Application", "Stream"]
 log = logs.get(__name__)
 
 HOUSEKEEPING_S = 1.0
+# What one batch should take at most: nobody who comes while it runs waits for much longer.
+_BATCH_S = 0.05
 
 
 def steady_unix_clock() -> Callable[[], float]:
@@ -90,6 +92,7 @@ class Application:
             self._run,
             queue_size=settings.queue_size,
             max_batch_cost=settings.max_batch_points,
+            batch_s=_BATCH_S,
             report=self._note_batch,
         )
         self._forecaster = Forecaster(self._choices, self._batcher, metrics)
