@@ -52,11 +52,13 @@ sanitize: $(INSTALLED) ## run the kernels' tests under address and undefined-beh
 protos: $(INSTALLED) ## generate the code of the contract and lint it
 	$(BIN)/python scripts/protos.py
 
-bench: $(INSTALLED) ## time the model beside its bare matrix products, on one thread and on two
+bench: $(INSTALLED) ## time the model beside its bare matrix products, then the service around it
 	$(BIN)/python benchmarks/model.py --threads 1 --json benchmarks/results/model-1-thread.json
 	$(BIN)/python benchmarks/model.py --threads 2 --json benchmarks/results/model-2-threads.json
 	$(BIN)/python -m benchmarks.decoding --threads 1 --check --json benchmarks/results/decoding-1-thread.json
 	$(BIN)/python -m benchmarks.decoding --threads 2 --check --json benchmarks/results/decoding-2-threads.json
+	$(BIN)/python -m benchmarks.service --json benchmarks/results/service.json
+	$(BIN)/python -m benchmarks.overload --json benchmarks/results/overload.json
 
 crash: $(INSTALLED) ## kill the service 100 times under load and look for what is missing (half an hour)
 	$(BIN)/python -m benchmarks.crash --kills 100 --json benchmarks/results/crash.json $(ARGS)

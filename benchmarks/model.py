@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from trajectron_model import online
 from trajectron_model.config import ModelConfig
 from trajectron_model.forecast import ForecastRequest
+from trajectron_model.packed import PackedScene, blank_scene
 from trajectron_model.state import SceneFrame, SceneState
 from trajectron_model.trajectron import Trajectron
 
@@ -31,20 +33,21 @@ AGENTS = (1, 5, 20, 40, 200)
 GROWTH = (250, 500, 1000, 2000)
 SAMPLES, HORIZON = 200, 12
 PER_AGENT_AREA_M2 = 6.0
+MANY_SCENES, SMALL_SCENE = 100, 5
 
 
-def scene(model: Trajectron, agents: int) -> tuple[SceneState, SceneFrame]:
-    """A state after 8 frames of a crowd of constant density, and the next frame."""
+def scene(model: Trajectron, agents: int) -> tuple[PackedScene, SceneFrame]:
+    """A scene after 8 frames of a crowd of constant density, and the next frame."""
     random = np.random.default_rng(agents)
     place = random.uniform(0.0, (agents * PER_AGENT_AREA_M2) ** 0.5, (agents, 2))
     velocity = random.normal(0.0, 0.8, (agents, 2))
     ids = tuple(str(i) for i in range(agents))
     types = ("pedestrian",) * agents
     frames = [SceneFrame(0.4 * t, ids, types, place + 0.4 * t * velocity) for t in range(9)]
-    state = model.initial_state()
+    packed = blank_scene()
     for frame in frames[:-1]:
-        (state,) = model.step([state], [frame])
-    return state, frames[-1]
+        (packed,) = online.step(model, [packed], [frame])
+    return packed, frames[-1]
 
 
 def bare_rollout(model: Trajectron, agents: int) -> Callable[[], None]:
@@ -114,31 +117,51 @@ def measure(repeats: int) -> dict[str, Any]:
     model = Trajectron(ModelConfig()).eval().requires_grad_(False)
     sampling, step, growth = {}, {}, {}
     for agents in AGENTS:
-        state, frame = scene(model, agents)
+        packed, frame = scene(model, agents)
         request = ForecastRequest(num_samples=SAMPLES, horizon=HORIZON)
 
-        def sample(s: SceneState = state, r: ForecastRequest = request) -> Any:
-            return model.forecast([s], [r])
+        def sample(s: PackedScene = packed, r: ForecastRequest = request) -> Any:
+            return model.forecast([online.state_of(model, s)], [r])
 
-        def advance(s: SceneState = state, f: SceneFrame = frame) -> Any:
+        def advance(s: PackedScene = packed, f: SceneFrame = frame) -> Any:
+            return online.step(model, [s], [f])
+
+        state = online.state_of(model, packed)
+
+        def by_torch(s: SceneState = state, f: SceneFrame = frame) -> Any:
             return model.step([s], [f])
 
         with torch.inference_mode():
             sampling[agents] = row(*in_turn(sample, bare_rollout(model, agents), repeats))
             step[agents] = row(*in_turn(advance, bare_step(model, agents), 5 * repeats))
+            torch_s, _ = in_turn(by_torch, lambda: None, 5 * repeats)
+            step[agents]["torch_ms"] = 1e3 * statistics.median(torch_s)
     for agents in GROWTH:
-        state, frame = scene(model, agents)
+        packed, frame = scene(model, agents)
 
-        def grow(s: SceneState = state, f: SceneFrame = frame) -> Any:
-            return model.step([s], [f])
+        def grow(s: PackedScene = packed, f: SceneFrame = frame) -> Any:
+            return online.step(model, [s], [f])
 
         ours, _ = in_turn(grow, lambda: None, 3 * repeats)
         growth[agents] = {"step_ms": 1e3 * statistics.median(ours)}
+    many = [scene(model, SMALL_SCENE) for _ in range(MANY_SCENES)]
+
+    def together() -> Any:
+        return online.step(model, [one for one, _ in many], [frame for _, frame in many])
+
+    def one_by_one() -> Any:
+        return [online.step(model, [one], [frame]) for one, frame in many]
+
+    batched, single = in_turn(together, one_by_one, 5 * repeats)
     per_agent = [growth[a]["step_ms"] / a for a in GROWTH]
     return {
         "sampling_200x12": sampling,
         "encoder_step": step,
         "step_growth": growth,
+        "step_of_100_scenes_of_5": {
+            "together_ms": 1e3 * statistics.median(batched),
+            "one_by_one_ms": 1e3 * statistics.median(single),
+        },
         "step_cost_per_agent_2000_over_250": per_agent[-1] / per_agent[0],
     }
 
@@ -154,6 +177,9 @@ def table(figures: dict[str, Any]) -> str:
             )
     for agents, f in figures["step_growth"].items():
         lines.append(f"| step_growth | {agents} | {f['step_ms']:.2f} | | |")
+    many = figures["step_of_100_scenes_of_5"]
+    lines.append(f"| 100 scenes of 5 together | 500 | {many['together_ms']:.2f} | | |")
+    lines.append(f"| 100 scenes of 5 one by one | 500 | {many['one_by_one_ms']:.2f} | | |")
     ratio = figures["step_cost_per_agent_2000_over_250"]
     lines.append(f"\nCost of a step per agent, 2000 agents against 250: {ratio:.2f}")
     return "\n".join(lines)

@@ -12,6 +12,7 @@ import typer
 
 from trajectron_service.commands import (
     evaluate,
+    load,
     models,
     predict,
     replay,
@@ -55,6 +56,7 @@ def root(
 app.command()(serve.serve)
 app.command()(predict.predict)
 app.command()(replay.replay)
+app.command()(load.load)
 app.command()(simulate.simulate)
 app.command()(models.models)
 app.command()(train.train)
