@@ -32,12 +32,15 @@ RUN useradd --system --uid 10001 --no-create-home trajectron \
     && install --directory --owner trajectron /var/lib/trajectron
 COPY --from=build /opt/venv /opt/venv
 # 0.0.0.0 on purpose: inside a container the loopback address is out of reach. Publish the
-# ports where they are wanted, as deploy/compose.yaml does.
+# ports where they are wanted, as deploy/compose.yaml does. INSECURE says that the service need not
+# protect itself: it is plain text and open to whoever reaches its ports. To publish them further
+# than loopback, set it to 0 and give it certificates and tokens: docs/security.md.
 ENV PATH=/opt/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     PYTHONDONTWRITEBYTECODE=1 \
     MPLCONFIGDIR=/tmp/matplotlib \
     TRAJECTRON_HOST=0.0.0.0 \
+    TRAJECTRON_INSECURE=1 \
     TRAJECTRON_HTTP_PORT=8000 \
     TRAJECTRON_GRPC_PORT=50051 \
     TRAJECTRON_STATE_DIR=/var/lib/trajectron \

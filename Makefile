@@ -11,7 +11,7 @@ INSTALLED := $(VENV)/.installed
 ARGS ?=
 KERNELS := model/trajectron_model/kernels
 
-.PHONY: help install serve test check format protos bench crash handover paper clean
+.PHONY: help install serve test check sanitize format protos bench crash handover paper clean
 
 help: ## show this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-9s %s\n", $$1, $$2}'
@@ -45,6 +45,9 @@ check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentat
 format: $(INSTALLED) ## format the code and mend what the linter can
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+sanitize: $(INSTALLED) ## run the kernels' tests under address and undefined-behaviour sanitizers
+	$(BIN)/python scripts/sanitize.py $(ARGS)
 
 protos: $(INSTALLED) ## generate the code of the contract and lint it
 	$(BIN)/python scripts/protos.py

@@ -23,8 +23,8 @@ from typing import Any
 
 from benchmarks.handover import redis_server
 from trajectron_service import engine as engines
-from trajectron_service import records
-from trajectron_service.application import TENANT, Application
+from trajectron_service import records, tenancy
+from trajectron_service.application import Application
 from trajectron_service.engine import Engine
 from trajectron_service.messages import Agent, Frame, SessionConfig
 from trajectron_service.metrics import Metrics
@@ -84,7 +84,10 @@ async def writes_per_second(opening: Opening, sessions: int, data: bytes) -> flo
     store = await opening()
 
     async def push(number: int) -> None:
-        key, last = SessionKey(TENANT, str(number)), StoredSession(new_revision(), 1e12, data)
+        key, last = (
+            SessionKey(tenancy.current(), str(number)),
+            StoredSession(new_revision(), 1e12, data),
+        )
         await store.create(key, last, Quota(sessions))
         for _ in range(_WRITES // sessions):
             following = StoredSession(new_revision(), 1e12, data)
@@ -105,7 +108,7 @@ async def stored_bytes(engine: Engine, agents: int) -> tuple[int, int, bytes]:
         info = await app.create_session("one", SessionConfig())
         for step in range(_WARM):
             await app.observe(info.id, (frame(step, agents),), None)
-        stored = await store.read(SessionKey(TENANT, info.id))
+        stored = await store.read(SessionKey(tenancy.current(), info.id))
     assert stored is not None  # just written
     states = records.decode(stored.data).states
     assert isinstance(states, bytes)  # as they were stored

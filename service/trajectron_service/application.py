@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 
 from trajectron_service import choices as chosen
-from trajectron_service import logs, pages
+from trajectron_service import logs, pages, tenancy
 from trajectron_service.batching import Batcher, BatchReport
 from trajectron_service.choices import Choices
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
@@ -47,9 +47,9 @@ __all__ = ["Application", "Stream"]
 
 log = logs.get(__name__)
 
-# The only tenant until there are tokens.
-TENANT = "default"
 HOUSEKEEPING_S = 1.0
+# What one batch should take at most: nobody who comes while it runs waits for much longer.
+_BATCH_S = 0.05
 
 
 def steady_unix_clock() -> Callable[[], float]:
@@ -92,6 +92,7 @@ class Application:
             self._run,
             queue_size=settings.queue_size,
             max_batch_cost=settings.max_batch_points,
+            batch_s=_BATCH_S,
             report=self._note_batch,
         )
         self._forecaster = Forecaster(self._choices, self._batcher, metrics)
@@ -226,7 +227,7 @@ class Application:
         with self._work.taken():
             size = pages.size(page_size)
             after = pages.read_token(page_token)
-            infos, more = await self._sessions.page(TENANT, after, size)
+            infos, more = await self._sessions.page(tenancy.current(), after, size)
             return infos, pages.write_token(infos[-1].id) if more and infos else ""
 
     async def delete_session(self, session_id: str) -> None:
@@ -447,4 +448,5 @@ def _past(kind: ErrorKind) -> Iterator[None]:
 
 
 def _key(session_id: str) -> SessionKey:
-    return SessionKey(TENANT, session_id)
+    """A session of the caller's: nobody can name another tenant's."""
+    return SessionKey(tenancy.current(), session_id)

@@ -5,12 +5,17 @@ fixed delay: an idle batcher starts at once, and what arrives meanwhile forms th
 
 - **Order.** Entries of one key (a session) run in the order submitted, one to a batch.
 - **Fairness.** Rounds: a key's next entry waits a round after its last one, so that a busy
-  session takes turns with the others. Within a round the earliest deadline goes first.
-- **Cost.** A batch closes before the entry that would take it beyond ``max_batch_cost``; an
-  entry that alone costs more runs alone.
-- **Dropping.** Entries that are cancelled or past their deadline never run, and leave their
-  place in the queue at once.
-- **Bounds.** A full queue refuses at once (``QueueFull``), with an estimate of when to retry.
+  session takes turns with the others. Within a round the earliest deadline goes first; urgent
+  entries (frames to observe) go before all others.
+- **Cost.** A batch closes before the entry that would take it beyond ``max_batch_cost``, or
+  beyond ``batch_s`` by what is known of the pace; an entry that alone costs more runs alone.
+- **Slices.** Long work comes in parts. A batch has room for one part beside the short work, so
+  neither waits for the other. A long entry that has begun is finished before the next one
+  begins, or all would end late; unless the other cannot wait and this one can.
+- **Dropping.** Entries that are cancelled, past their deadline or sure to miss it never run (no
+  further part of them does), and leave their place in the queue at once.
+- **Bounds.** A full queue refuses at once (``QueueFull``), with an estimate of when to retry. So
+  does one that would be too slow for a deadline (``TooLate``).
 - **Faults.** When a batch raises, its entries run one by one; only the guilty ones fail.
 """
 
@@ -20,18 +25,20 @@ import asyncio
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
+
+from trajectron_service.pace import Pace, Work
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
 
 _MIN_RETRY_S = 0.05
 _MAX_RETRY_S = 10.0
-# Weight of the newest batch in the running mean of the time per entry.
-_PACE_WEIGHT = 0.2
+_NEVER = float("inf")
+_ONE = Work(jobs=1.0)
 
 
 class QueueFull(Exception):
@@ -40,6 +47,25 @@ class QueueFull(Exception):
     def __init__(self, retry_after_s: float) -> None:
         super().__init__("the queue is full")
         self.retry_after_s = retry_after_s
+
+
+class TooLate(Exception):
+    """The work would not be done by its deadline, so it is not begun.
+
+    Attributes:
+        queue_s: seconds until what goes before it is done.
+        own_s: seconds of the work itself.
+        left_s: seconds until the deadline.
+    """
+
+    def __init__(self, queue_s: float, own_s: float, left_s: float) -> None:
+        super().__init__(
+            f"about {(queue_s + own_s) * 1e3:.0f} ms are needed ({queue_s * 1e3:.0f} ms of them "
+            f"until other work is done), {left_s * 1e3:.0f} ms are left"
+        )
+        self.queue_s = queue_s
+        self.own_s = own_s
+        self.left_s = left_s
 
 
 class Closed(Exception):
@@ -59,14 +85,26 @@ class BatchReport:
     ran_s: float
 
 
+@dataclass(frozen=True)
+class Part(Generic[JobT]):
+    """Work that runs in one go: what to do, its cost against a batch's limit, its amounts."""
+
+    job: JobT
+    cost: float = 1.0
+    work: Work = _ONE
+
+
 @dataclass(eq=False)
 class _Entry(Generic[JobT, ResultT]):
-    job: JobT
-    cost: float
+    parts: deque[Part[JobT]]  # not begun
     deadline: float
+    urgent: bool
     arrival: int
     queued_at: float
-    done: asyncio.Future[ResultT]
+    done: asyncio.Future[list[ResultT]]
+    long: bool
+    results: list[ResultT] = field(default_factory=list)
+    started: bool = False
 
 
 @dataclass(eq=False)
@@ -77,6 +115,10 @@ class _Line(Generic[JobT, ResultT]):
     entries: deque[_Entry[JobT, ResultT]] = field(default_factory=deque)
 
 
+# An entry with the part of it that a batch runs.
+_Taken = tuple[_Entry[JobT, ResultT], Part[JobT]]
+
+
 class Batcher(Generic[JobT, ResultT]):
     """Runs jobs in batches on one thread of its own. Use from one event loop.
 
@@ -84,6 +126,8 @@ class Batcher(Generic[JobT, ResultT]):
         run: does a batch; results in the order of jobs. It runs on the batcher's thread.
         queue_size: entries that may wait.
         max_batch_cost: see the module.
+        batch_s: seconds that a batch should take at most.
+        pace: what is known of how long work takes; it learns here.
         clock: seconds, rising; deadlines are on it.
         report: told about every batch, on the event loop.
     """
@@ -94,12 +138,16 @@ class Batcher(Generic[JobT, ResultT]):
         *,
         queue_size: int,
         max_batch_cost: float,
+        batch_s: float = _NEVER,
+        pace: Pace | None = None,
         clock: Callable[[], float] = time.monotonic,
         report: Callable[[BatchReport], None] = lambda _: None,
     ) -> None:
+        self.pace = pace or Pace()
         self._run = run
         self._queue_size = queue_size
         self._max_batch_cost = max_batch_cost
+        self._batch_s = batch_s
         self._clock = clock
         self._report = report
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="inference")
@@ -108,7 +156,8 @@ class Batcher(Generic[JobT, ResultT]):
         self._round = 0
         self._arrivals = itertools.count()
         self._worker: asyncio.Task[None] | None = None
-        self._pace_s = 0.0
+        self._begun: _Entry[JobT, ResultT] | None = None  # the long entry at work
+        self._busy_until = 0.0
         self._closed = False
 
     @property
@@ -117,30 +166,81 @@ class Batcher(Generic[JobT, ResultT]):
         return self._waiting
 
     async def submit(
-        self, job: JobT, *, key: Hashable = None, cost: float = 1.0, deadline: float | None = None
+        self,
+        job: JobT,
+        *,
+        key: Hashable = None,
+        cost: float = 1.0,
+        work: Work = _ONE,
+        deadline: float | None = None,
+        urgent: bool = False,
     ) -> ResultT:
-        """The result of ``job``; ``key`` None stands in no line but its own.
+        """The result of ``job``; see ``submit_parts``."""
+        (result,) = await self.submit_parts(
+            [Part(job, cost, work)], key=key, deadline=deadline, urgent=urgent
+        )
+        return result
+
+    async def submit_parts(
+        self,
+        parts: Sequence[Part[JobT]],
+        *,
+        key: Hashable = None,
+        deadline: float | None = None,
+        urgent: bool = False,
+    ) -> list[ResultT]:
+        """The results of parts of one piece of work, in order; several make it long work.
+
+        Args:
+            parts: at least one.
+            key: None stands in no line but its own.
+            deadline: on the batcher's clock.
+            urgent: goes before all that is not.
 
         Raises:
-            QueueFull, Closed: at once, without waiting.
-            Expired: the deadline passed before the job was done.
-            Exception: whatever ``run`` raised for this job.
+            QueueFull, TooLate, Closed: at once, without waiting; TooLate also when other work
+                has taken the time that there was.
+            Expired: the deadline passed before the work was done.
+            Exception: whatever ``run`` raised for this work.
         """
+        entry = self._enqueue(parts, key, _NEVER if deadline is None else deadline, urgent)
+        line_key = key if key is not None else entry
+        left_s = None if deadline is None else deadline - entry.queued_at
+        try:
+            async with asyncio.timeout(left_s):
+                return await entry.done
+        except TimeoutError:
+            if entry.done.cancelled():
+                raise Expired("the deadline passed before the work was done") from None
+            raise
+        finally:
+            if entry.done.cancelled():
+                self._forget(line_key, entry)
+            # An exception holds this frame, and the entry holds the exception: without this
+            # only the cyclic collector could free them.
+            del entry, line_key
+
+    def _enqueue(
+        self, parts: Sequence[Part[JobT]], key: Hashable, deadline: float, urgent: bool
+    ) -> _Entry[JobT, ResultT]:
+        """Puts work into its line, unless it is refused."""
         now = self._clock()
         if self._closed:
             raise Closed("the batcher is closed")
-        if deadline is not None and deadline <= now:
+        if deadline <= now:
             raise Expired("the deadline passed before the work was queued")
         if self._waiting >= self._queue_size:
             raise QueueFull(self._retry_after_s())
+        self.check(parts, deadline=deadline)
         loop = asyncio.get_running_loop()
         entry = _Entry[JobT, ResultT](
-            job=job,
-            cost=cost,
-            deadline=float("inf") if deadline is None else deadline,
+            parts=deque(parts),
+            deadline=deadline,
+            urgent=urgent,
             arrival=next(self._arrivals),
             queued_at=now,
             done=loop.create_future(),
+            long=len(parts) > 1,
         )
         line_key = key if key is not None else entry
         line = self._lines.get(line_key)
@@ -150,16 +250,28 @@ class Batcher(Generic[JobT, ResultT]):
         self._waiting += 1
         if self._worker is None or self._worker.done():
             self._worker = loop.create_task(self._work(), name="batcher")
-        try:
-            async with asyncio.timeout(None if deadline is None else deadline - now):
-                return await entry.done
-        except TimeoutError as error:
-            if entry.done.cancelled():
-                raise Expired("the deadline passed before the work was done") from error
-            raise
-        finally:
-            if entry.done.cancelled():
-                self._forget(line_key, entry)
+        return entry
+
+    def check(self, parts: Sequence[Part[JobT]], *, deadline: float | None) -> None:
+        """Raises TooLate for work that would not be done by its deadline."""
+        if deadline is None or deadline == _NEVER:
+            return
+        left_s = deadline - self._clock()
+        own_s = self.pace.batch_s + self._seconds(parts)
+        queue_s = self.queue_s(deadline)
+        if queue_s + own_s > left_s:
+            if own_s > left_s:
+                self.pace.doubt(parts[0].work)
+            raise TooLate(queue_s, own_s, left_s)
+
+    def queue_s(self, deadline: float) -> float:
+        """Seconds until what goes before work with this deadline is done."""
+        ahead_s = max(self._busy_until - self._clock(), 0.0)
+        for line in self._lines.values():
+            for entry in line.entries:
+                if entry.urgent or entry.deadline <= deadline or entry is self._begun:
+                    ahead_s += self._seconds(entry.parts)
+        return ahead_s
 
     async def run_alone(self, call: Callable[[], None]) -> None:
         """Runs something else on the batcher's thread, between batches."""
@@ -172,43 +284,90 @@ class Batcher(Generic[JobT, ResultT]):
             await self._worker
         self._thread.shutdown(wait=False)
 
+    def _seconds(self, parts: Iterable[Part[JobT]]) -> float:
+        return sum(self.pace.seconds(part.work) for part in parts)
+
     async def _work(self) -> None:
         """Runs batches until nothing waits."""
         # What was submitted in this turn of the loop joins the first batch.
         await asyncio.sleep(0)
-        while self._waiting:
+        while self._lines:
             batch = self._take()
             if batch:
                 await self._do(batch)
 
-    def _take(self) -> list[_Entry[JobT, ResultT]]:
+    def _take(self) -> list[_Taken[JobT, ResultT]]:
         """Takes the next batch off the queue and drops what need not run."""
         now = self._clock()
         for line in self._lines.values():
             self._drop_dead(line, now)
-        ready = sorted(
-            (line for line in self._lines.values() if line.entries),
-            key=lambda line: (line.round, line.entries[0].deadline, line.entries[0].arrival),
-        )
-        batch: list[_Entry[JobT, ResultT]] = []
-        cost = 0.0
+        ready = [line for line in self._lines.values() if line.entries]
+        ready.sort(key=_turn)
+        long = self._next_long([line for line in ready if line.entries[0].long], now)
+        chosen: list[_Line[JobT, ResultT]] = []
+        cost = seconds = 0.0
         for line in ready:
-            cost += line.entries[0].cost
-            if batch and cost > self._max_batch_cost:
+            if line.entries[0].long:
+                continue
+            part = line.entries[0].parts[0]
+            cost += part.cost
+            seconds += self.pace.seconds(part.work)
+            if chosen and (cost > self._max_batch_cost or seconds > self._batch_s):
                 break
-            self._round = max(self._round, line.round)
-            line.round = self._round + 1
-            batch.append(line.entries.popleft())
-        self._waiting -= len(batch)
+            chosen.append(line)
+        if long is not None:
+            chosen.append(long)
+        batch = [self._taken(line) for line in chosen]
         self._lines = {key: line for key, line in self._lines.items() if line.entries}
         return batch
 
+    def _next_long(
+        self, lines: Sequence[_Line[JobT, ResultT]], now: float
+    ) -> _Line[JobT, ResultT] | None:
+        """Whose long entry goes on: the one begun, unless a more pressing one cannot wait."""
+        if not lines:
+            self._begun = None
+            return None
+        first = lines[0]
+        begun = next((line for line in lines if line.entries[0] is self._begun), first)
+        if begun is not first:
+            ours_s = self._seconds(begun.entries[0].parts)
+            other = first.entries[0]
+            both = now + ours_s + self._seconds(other.parts)
+            if both > other.deadline and both <= begun.entries[0].deadline:
+                begun = first
+        self._begun = begun.entries[0]
+        return begun
+
+    def _taken(self, line: _Line[JobT, ResultT]) -> _Taken[JobT, ResultT]:
+        """The next part of a line's first entry, which leaves the line with its last part."""
+        entry = line.entries[0]
+        part = entry.parts.popleft()
+        self._waiting -= not entry.started
+        entry.started = True
+        if not entry.parts:
+            if entry is self._begun:
+                self._begun = None
+            line.entries.popleft()
+            self._round = max(self._round, line.round)
+            line.round = self._round + 1
+        return entry, part
+
     def _drop_dead(self, line: _Line[JobT, ResultT], now: float) -> None:
-        alive = deque(e for e in line.entries if not e.done.done() and e.deadline > now)
+        """Drops entries that nobody waits for, or that come too late whatever is done."""
+        alive: deque[_Entry[JobT, ResultT]] = deque()
         for entry in line.entries:
-            if not entry.done.done() and entry.deadline <= now:
-                entry.done.set_exception(Expired("the deadline passed in the queue"))
-        self._waiting -= len(line.entries) - len(alive)
+            if not entry.done.done() and entry.deadline < _NEVER:
+                own_s = self._seconds(entry.parts)
+                left_s = entry.deadline - now
+                if left_s <= 0.0:
+                    entry.done.set_exception(Expired("the deadline passed in the queue"))
+                elif own_s > left_s:
+                    entry.done.set_exception(TooLate(0.0, own_s, left_s))
+            if entry.done.done():
+                self._waiting -= not entry.started
+            else:
+                alive.append(entry)
         line.entries = alive
 
     def _forget(self, key: Hashable, entry: _Entry[JobT, ResultT]) -> None:
@@ -217,44 +376,44 @@ class Batcher(Generic[JobT, ResultT]):
         if line is None or entry not in line.entries:
             return
         line.entries.remove(entry)
-        self._waiting -= 1
+        self._waiting -= not entry.started
         if not line.entries:
             del self._lines[key]
 
-    async def _do(self, batch: list[_Entry[JobT, ResultT]]) -> None:
+    async def _do(self, batch: list[_Taken[JobT, ResultT]]) -> None:
         start = self._clock()
+        works = [part.work for _, part in batch]
+        self._busy_until = start + self.pace.batch_s + sum(map(self.pace.seconds, works))
         try:
-            results = await self._on_thread([entry.job for entry in batch])
+            results = await self._on_thread([part.job for _, part in batch])
         except Exception as error:  # noqa: BLE001 - whatever run raises belongs to its callers
             await self._do_singly(batch, error)
         else:
-            for entry, result in zip(batch, results, strict=True):
-                if not entry.done.done():
-                    entry.done.set_result(result)
-        ran_s = self._clock() - start
-        pace_s = ran_s / len(batch)
-        self._pace_s += _PACE_WEIGHT * (pace_s - self._pace_s)
-        waited_s = tuple(start - entry.queued_at for entry in batch)
-        self._report(BatchReport(len(batch), waited_s, ran_s))
+            self.pace.learn(works, self._clock() - start)
+            for (entry, _), result in zip(batch, results, strict=True):
+                _put(entry, result)
+        self._busy_until = 0.0
+        waited_s = tuple(start - entry.queued_at for entry, _ in batch)
+        self._report(BatchReport(len(batch), waited_s, self._clock() - start))
 
-    async def _do_singly(self, batch: list[_Entry[JobT, ResultT]], error: Exception) -> None:
+    async def _do_singly(self, batch: list[_Taken[JobT, ResultT]], error: Exception) -> None:
         """Finds the entries that a failed batch failed for."""
-        for entry in batch:
+        for entry, part in batch:
             if entry.done.done():
                 continue
+            fault = error
             if len(batch) > 1:
                 try:
-                    (result,) = await self._on_thread([entry.job])
+                    (result,) = await self._on_thread([part.job])
                 except Exception as own:  # noqa: BLE001 - as above
                     fault = own
                 else:
-                    if not entry.done.done():
-                        entry.done.set_result(result)
+                    _put(entry, result)
                     continue
-            else:
-                fault = error
             if not entry.done.done():
                 entry.done.set_exception(fault)
+            # It holds this frame: see ``submit_parts``.
+            del fault
 
     async def _on_thread(self, jobs: list[JobT]) -> Sequence[ResultT]:
         loop = asyncio.get_running_loop()
@@ -264,4 +423,17 @@ class Batcher(Generic[JobT, ResultT]):
         return results
 
     def _retry_after_s(self) -> float:
-        return min(max(self._waiting * self._pace_s, _MIN_RETRY_S), _MAX_RETRY_S)
+        return min(max(self.queue_s(_NEVER), _MIN_RETRY_S), _MAX_RETRY_S)
+
+
+def _turn(line: _Line[JobT, ResultT]) -> tuple[bool, int, float, int]:
+    """The place of a line in the order of the queue."""
+    first = line.entries[0]
+    return (not first.urgent, line.round, first.deadline, first.arrival)
+
+
+def _put(entry: _Entry[JobT, ResultT], result: ResultT) -> None:
+    """Takes a part's result; the last one answers the entry."""
+    entry.results.append(result)
+    if not entry.parts and not entry.done.done():
+        entry.done.set_result(entry.results)

@@ -14,6 +14,7 @@ from trajectron_service.messages import (
     ForecastOptions,
     SessionConfig,
 )
+from trajectron_service.pace import Work
 from trajectron_service.scenes import ForecastTask, ModelFacts
 from trajectron_service.settings import Settings
 from trajectron_service.timebase import Grid, Timeline, head
@@ -178,6 +179,15 @@ def task_points(task: ForecastTask, model: ModelFacts) -> int:
     samples = 0 if task.mode is ForecastMode.GMM else task.num_samples
     modes = model.info.latent_values if task.include_modes or not samples else 0
     return agents * (samples + modes) * task.horizon
+
+
+def task_work(task: ForecastTask, model: ModelFacts) -> Work:
+    """What a forecast is made of, for the learned pace."""
+    agents = len(task.agents or task.head.ids)
+    samples = 0 if task.mode is ForecastMode.GMM else task.num_samples
+    modes = model.info.latent_values if task.include_modes or not samples else 0
+    step = agents if task.head.frame is not None else 0
+    return Work(0.0, step, agents * samples * task.horizon, agents * modes * task.horizon)
 
 
 def session_id(wanted: str | None) -> str:

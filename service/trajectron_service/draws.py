@@ -74,20 +74,22 @@ def forecast_all(
 def _draws(task: ForecastTask, state: SceneState, config: ModelConfig) -> list[_Draw]:
     """The task, cut by how many steps its agents have been away; nothing for an empty scene.
 
-    Agents that cannot move are left out unless they are asked for.
+    Agents that cannot move are left out unless they are asked for, as are those of other shares.
     """
     away = (task.head.time_s - state.last_seen_s.numpy()) / config.dt_s  # [N]
     away = np.where(np.abs(away - np.rint(away)) < _WHOLE, np.rint(away), away)
-    groups: dict[float, list[str]] = defaultdict(list)
     rows = zip(state.ids, state.node_type.tolist(), away.tolist(), strict=True)
     if task.agents is None:
-        for agent, kind, steps in rows:
-            if not config.types[kind].stationary:
-                groups[steps].append(agent)
+        wanted = [
+            (agent, steps) for agent, kind, steps in rows if not config.types[kind].stationary
+        ]
     else:
         steps_away = {agent: steps for agent, _, steps in rows}
-        for agent in task.agents:
-            groups[steps_away[agent]].append(agent)
+        wanted = [(agent, steps_away[agent]) for agent in task.agents]
+    share, shares = task.share
+    groups: dict[float, list[str]] = defaultdict(list)
+    for agent, steps in wanted[len(wanted) * share // shares : len(wanted) * (share + 1) // shares]:
+        groups[steps].append(agent)
     return [_Draw(task, state, tuple(agents), steps) for steps, agents in groups.items()]
 
 

@@ -15,6 +15,9 @@ DOMAIN = "trajectron"
 class ErrorKind(enum.Enum):
     """What went wrong; the value is ``ErrorInfo.reason`` and the problem type."""
 
+    UNAUTHENTICATED = "UNAUTHENTICATED"
+    PERMISSION_DENIED = "PERMISSION_DENIED"
+    RATE_LIMITED = "RATE_LIMITED"
     INVALID_ARGUMENT = "INVALID_ARGUMENT"
     MALFORMED = "MALFORMED"
     UNKNOWN_SESSION = "UNKNOWN_SESSION"
@@ -50,6 +53,9 @@ class Codes:
 
 
 CODES: dict[ErrorKind, Codes] = {
+    ErrorKind.UNAUTHENTICATED: Codes("UNAUTHENTICATED", 401),
+    ErrorKind.PERMISSION_DENIED: Codes("PERMISSION_DENIED", 403),
+    ErrorKind.RATE_LIMITED: Codes("RESOURCE_EXHAUSTED", 429, retryable=True),
     ErrorKind.INVALID_ARGUMENT: Codes("INVALID_ARGUMENT", 422),
     ErrorKind.MALFORMED: Codes("INVALID_ARGUMENT", 400),
     ErrorKind.UNKNOWN_SESSION: Codes("NOT_FOUND", 404),

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 from trajectron_service import logs
-from trajectron_service.batching import Batcher, Closed, Expired, QueueFull
-from trajectron_service.choices import Choices, task_points
+from trajectron_service.batching import Batcher, Closed, Expired, Part, QueueFull, TooLate
+from trajectron_service.choices import Choices, task_points, task_work
 from trajectron_service.errors import ErrorKind, FieldViolation, ServiceError
 from trajectron_service.messages import (
     AgentForecast,
@@ -25,6 +26,7 @@ from trajectron_service.messages import (
     SceneGraph,
 )
 from trajectron_service.metrics import Metrics
+from trajectron_service.pace import Work
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
 from trajectron_service.timebase import Observation, Step, advance, classify, head
@@ -34,6 +36,8 @@ log = logs.get(__name__)
 
 # An agent's encoder step costs about as much as this many sampled positions.
 _STEP_POINTS = 20
+# A forecast that takes longer than this is made in slices, so that others have their turn.
+_SLICE_S = 0.025
 # Checking this many agents takes some milliseconds; then others have their turn on the loop.
 _AGENTS_PER_TURN = 2000
 _REFUSED = {
@@ -116,7 +120,7 @@ class Forecaster:
         result = None
         if folded.steps or folded.tasks:
             job = self._job(record, folded, pack)
-            result = await self._submit(job, key, self._cost(folded), deadline)
+            result = await self._run(job, key, deadline)
         after, packed = _with_states(folded.record, record, result)
         answers = folded.answers
         for number, (index, task) in enumerate(folded.tasks.items()):
@@ -141,7 +145,7 @@ class Forecaster:
         model = self._model(record)
         task = self._choices.task(options, record.timeline, record.version, model)
         job = dataclasses.replace(_idle_job(record), forecasts=(task,))
-        result = await self._submit(job, key, task_points(task, model), deadline)
+        result = await self._run(job, key, deadline)
         after, _ = _with_states(record, record, result)
         return after, self._forecast(record, task, result.forecasts[0])
 
@@ -154,7 +158,7 @@ class Forecaster:
         self._model(record)
         where = head(record.timeline)
         job = dataclasses.replace(_idle_job(record), graph=where)
-        result = await self._submit(job, key, len(where.ids), deadline)
+        result = await self._run(job, key, deadline)
         assert result.graph is not None  # asked for
         after, _ = _with_states(record, record, result)
         return after, result.graph
@@ -164,7 +168,7 @@ class Forecaster:
         if isinstance(record.states, bytes):
             return record.states
         job = dataclasses.replace(_idle_job(record), pack=True)
-        result = await self._submit(job, None, record.agent_count, None)
+        result = await self._run(job, None, None)
         assert result.packed is not None  # asked for
         return result.packed
 
@@ -246,30 +250,98 @@ class Forecaster:
             pack=pack,
         )
 
-    def _cost(self, fold: _Fold) -> float:
-        model = self._choices.model(fold.record.model)
-        drawn = sum(task_points(task, model) for task in fold.tasks.values())
-        return drawn + _STEP_POINTS * sum(len(step.frame.ids) for step in fold.steps)
+    async def _run(self, job: SceneJob, key: Hashable, deadline: float | None) -> SceneResult:
+        """Does a job: at once, or, when its forecasts take long, in slices between other work."""
+        model = self._choices.model(job.model)
+        shares = [self._shares(task, model) for task in job.forecasts]
+        if max(shares, default=1) == 1 or not _from_kept(job):
+            parts = [self._part(job, model)]
+            (result,) = await self._submit(parts, key, deadline, urgent=_observes(job))
+            return result
+        slices = [
+            dataclasses.replace(task, share=(share, count))
+            for task, count in zip(job.forecasts, shares, strict=True)
+            for share in range(count)
+        ]
+        stepping = self._part(dataclasses.replace(job, forecasts=()), model)
+        drawing = [self._slice(job, one, model) for one in slices]
+        self._refuse_late([stepping, *drawing], deadline)
+        (stepped,) = await self._submit([stepping], key, deadline, urgent=True)
+        # Slices are made from the states after the steps, so only now are they whole jobs.
+        live = [
+            dataclasses.replace(
+                part, job=dataclasses.replace(part.job, states=stepped.states, serials=job.keep)
+            )
+            for part in drawing
+        ]
+        drawn = iter(await self._submit(live, key, deadline))
+        forecasts = tuple(
+            tuple(agent for _ in range(count) for agent in next(drawn).forecasts[0])
+            for count in shares
+        )
+        return dataclasses.replace(stepped, forecasts=forecasts)
+
+    def _shares(self, task: ForecastTask, model: ModelFacts) -> int:
+        """Into how many slices a forecast is cut; none is smaller than one agent."""
+        seconds = self._batcher.pace.seconds(task_work(task, model))
+        agents = len(task.agents or task.head.ids)
+        return max(1, min(agents, math.ceil(seconds / _SLICE_S)))
+
+    def _part(self, job: SceneJob, model: ModelFacts) -> Part[SceneJob]:
+        stepped = sum(len(step.frame.ids) for step in job.steps)
+        drawn = sum(task_points(task, model) for task in job.forecasts)
+        works = [task_work(task, model) for task in job.forecasts]
+        amounts = (sum(column) for column in zip(Work(1.0, stepped), *works, strict=True))
+        return Part(job, drawn + _STEP_POINTS * stepped, Work(*amounts))
+
+    def _slice(self, job: SceneJob, task: ForecastTask, model: ModelFacts) -> Part[SceneJob]:
+        """One slice; its amounts are an equal share of the whole's."""
+        count = task.share[1]
+        whole = task_work(task, model)
+        work = Work(1.0, *(amount / count for amount in whole[1:]))
+        alone = SceneJob(job.model, (), (), forecasts=(task,))
+        return Part(alone, task_points(task, model) / count, work)
+
+    def _refuse_late(self, parts: Sequence[Part[SceneJob]], deadline: float | None) -> None:
+        try:
+            self._batcher.check(parts, deadline=deadline)
+        except TooLate as error:
+            raise _late(error) from None
 
     async def _submit(
-        self, job: SceneJob, key: Hashable, cost: float, deadline: float | None
-    ) -> SceneResult:
+        self,
+        parts: Sequence[Part[SceneJob]],
+        key: Hashable,
+        deadline: float | None,
+        *,
+        urgent: bool = False,
+    ) -> list[SceneResult]:
         ticket = self._metrics.tracing.ticket()
         if ticket is not None:
-            job = dataclasses.replace(job, ticket=ticket)
+            parts = [
+                dataclasses.replace(part, job=dataclasses.replace(part.job, ticket=ticket))
+                for part in parts
+            ]
         try:
-            return await self._batcher.submit(job, key=key, cost=cost, deadline=deadline)
+            return await self._batcher.submit_parts(
+                parts, key=key, deadline=deadline, urgent=urgent
+            )
         except QueueFull as error:
+            # ``from None``, here and below: refusals are many when there is too much to do, and
+            # each would keep the frames that it came through.
             raise ServiceError(
                 ErrorKind.OVERLOADED,
                 "the service is busy: too much work waits already; try again later",
                 retry_after_s=error.retry_after_s,
-            ) from error
+            ) from None
+        except TooLate as error:
+            raise _late(error) from None
         except Expired as error:
-            raise ServiceError(ErrorKind.DEADLINE_EXCEEDED, str(error)) from error
-        except Closed as error:
-            raise ServiceError(ErrorKind.DRAINING, "the service is stopping") from error
+            raise ServiceError(ErrorKind.DEADLINE_EXCEEDED, str(error)) from None
+        except Closed:
+            raise ServiceError(ErrorKind.DRAINING, "the service is stopping") from None
         except Exception as error:
+            job = parts[0].job
             log.exception("job failed", model=job.model, steps=len(job.steps))
             raise ServiceError(
                 ErrorKind.INTERNAL, "the model failed on this request; the fault is logged"
@@ -290,6 +362,21 @@ class Forecaster:
             agents=agents,
             sampling=task.sampling,
         )
+
+
+def _late(error: TooLate) -> ServiceError:
+    return ServiceError(ErrorKind.DEADLINE_EXCEEDED, f"not begun, for it would be late: {error}")
+
+
+def _observes(job: SceneJob) -> bool:
+    """Whether a job only folds frames, which is quick."""
+    return bool(job.steps) and not job.forecasts
+
+
+def _from_kept(job: SceneJob) -> bool:
+    """Whether all forecasts start from states that the job gives back."""
+    kept = {None, *job.keep}
+    return all(task.head.source in kept for task in job.forecasts)
 
 
 def _idle_job(record: SceneRecord) -> SceneJob:

@@ -13,6 +13,8 @@ import grpc
 from google.protobuf.message import DecodeError
 
 from trajectron_service import logs
+from trajectron_service.access import scope_of_rpc
+from trajectron_service.admission import Admission
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.grpc_errors import abort
 from trajectron_service.metrics import Metrics
@@ -50,9 +52,11 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
     Args:
         services: their full names, such as ``trajectron.v1.TrajectronService``.
         metrics: where durations and stages go.
+        admission: who is let in.
     """
 
-    def __init__(self, services: Sequence[str], metrics: Metrics) -> None:
+    def __init__(self, services: Sequence[str], metrics: Metrics, admission: Admission) -> None:
+        self._admission = admission
         self._services = frozenset(services)
         self._metrics = metrics
 
@@ -86,6 +90,7 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
             with self._measured(method, context) as record:
                 await record.send_traceparent(context)
                 try:
+                    self._admit(method, context)
                     return await behaviour(_checked(request), context)
                 except Exception as error:  # noqa: BLE001  every fault becomes a status
                     await abort(context, record.failed(error))
@@ -97,6 +102,7 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
             with self._measured(method, context) as record:
                 await record.send_traceparent(context)
                 try:
+                    self._admit(method, context)
                     # Closed here, not by the garbage collector: a cancelled stream frees its
                     # session at once.
                     async with aclosing(behaviour(checked(request), context)) as answers:
@@ -106,6 +112,11 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
                     await abort(context, record.failed(error))
 
         return call
+
+    def _admit(self, method: str, context: Context) -> None:
+        given = dict(context.invocation_metadata() or ()).get("authorization")
+        text = given.decode("latin-1") if isinstance(given, bytes) else given
+        self._admission.admit(text, scope_of_rpc(method))
 
     @contextmanager
     def _measured(self, method: str, context: Context) -> Iterator[_Record]:

@@ -13,6 +13,7 @@ from trajectron_proto.v1 import (
     trajectron_pb2,
     trajectron_pb2_grpc,
 )
+from trajectron_service.admission import Admission
 from trajectron_service.application import Application
 from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.grpc_api import GrpcApi
@@ -39,6 +40,7 @@ def grpc_server(
     evaluations: Evaluations,
     health: Health,
     metrics: Metrics,
+    admission: Admission,
     settings: Settings,
 ) -> grpc.aio.Server:
     """Everything that is served over gRPC; not yet bound to a port.
@@ -48,10 +50,11 @@ def grpc_server(
         evaluations: the core: batch evaluations.
         health: what ``grpc.health.v1`` tells.
         metrics: where durations go.
+        admission: who is let in.
         settings: the limits of messages.
     """
     server = grpc.aio.server(
-        interceptors=[GrpcInterceptor(SERVICES, metrics)], options=_options(settings)
+        interceptors=[GrpcInterceptor(SERVICES, metrics, admission)], options=_options(settings)
     )
     trajectron_pb2_grpc.add_TrajectronServiceServicer_to_server(GrpcApi(application), server)
     evaluation_pb2_grpc.add_EvaluationServiceServicer_to_server(

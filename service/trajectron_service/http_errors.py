@@ -51,6 +51,8 @@ def problem_response(error: ServiceError) -> Response:
     if error.kind is ErrorKind.TOO_LARGE:
         # What of the body is still on its way will not be read.
         headers["Connection"] = "close"
+    if error.kind is ErrorKind.UNAUTHENTICATED:
+        headers["WWW-Authenticate"] = 'Bearer realm="trajectron"'
     if error.codes.retryable:
         headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_s or 1.0)))
     return _response(problem_of(error), headers)

@@ -12,6 +12,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars
 
 from trajectron_service import logs
+from trajectron_service.access import scope_of_path
+from trajectron_service.admission import Admission
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.http_errors import problem_response
 from trajectron_service.metrics import Metrics
@@ -37,9 +39,11 @@ class RequestMiddleware:
     Args:
         app: what answers.
         metrics: where durations go, by the route's template and not by its path.
+        admission: who is let in.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, admission: Admission) -> None:
+        self._admission = admission
         self._app = app
         self._metrics = metrics
 
@@ -54,7 +58,12 @@ class RequestMiddleware:
         start = time.perf_counter()
         with bound_contextvars(request_id=sender.request_id):
             try:
+                needed = scope_of_path(scope["path"])
+                self._admission.admit(Headers(scope=scope).get("authorization"), needed)
                 await self._app(scope, receive, sender)
+            except ServiceError as error:
+                # Not let in; errors of the routes are answered further in.
+                await sender.fail(scope, receive, error)
             except asyncio.CancelledError:
                 # Requests are cancelled only when a stop has run out of grace.
                 await sender.fail(scope, receive, _STOPPED)

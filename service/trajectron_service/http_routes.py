@@ -9,6 +9,7 @@ from starlette.responses import Response
 
 from trajectron_service import http_answers as answers
 from trajectron_service import http_errors
+from trajectron_service.admission import Admission
 from trajectron_service.application import Application
 from trajectron_service.errors import ServiceError
 from trajectron_service.evaluations.jobs import Evaluations
@@ -32,6 +33,7 @@ def http_app(
     evaluations: Evaluations,
     health: Health,
     metrics: Metrics,
+    admission: Admission,
     *,
     max_body_bytes: int,
     version: str,
@@ -43,12 +45,13 @@ def http_app(
         evaluations: the core: batch evaluations.
         health: what ``/readyz`` tells.
         metrics: what ``/metrics`` tells.
+        admission: who is let in.
         max_body_bytes: larger bodies are refused while they are read.
         version: of the distribution, for the OpenAPI page.
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
     app.state.metrics = metrics
-    app.add_middleware(RequestMiddleware, metrics=metrics)
+    app.add_middleware(RequestMiddleware, metrics=metrics, admission=admission)
     app.add_exception_handler(ServiceError, http_errors.on_service_error)
     app.add_exception_handler(HTTPException, http_errors.on_http_exception)
     app.add_exception_handler(RequestValidationError, http_errors.on_invalid_parameters)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from trajectron_service import engine, logs
+from trajectron_service.admission import Admission
 from trajectron_service.application import Application
 from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.grpc_server import SERVICES, grpc_server
@@ -24,9 +25,11 @@ from trajectron_service.health import Health
 from trajectron_service.http_routes import http_app
 from trajectron_service.http_server import HttpServer, listen
 from trajectron_service.metrics import Metrics
+from trajectron_service.protection import check_exposure, load_tls
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.stores import SessionStore
 from trajectron_service.stores.opening import open_store
+from trajectron_service.tokens import Tokens
 from trajectron_service.tracing import OFF, Tracing
 from trajectron_service.work import WorkInHand
 
@@ -51,6 +54,7 @@ class Service:
     health: Health
     metrics: Metrics
     store: SessionStore
+    admission: Admission
     http_port: int
     grpc_port: int
 
@@ -98,10 +102,15 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
         tracing: told of calls; as the settings say when None.
 
     Raises:
-        SettingsError: a port is taken, or a model cannot be loaded.
+        SettingsError: a port is taken, a model, certificate or file of tokens cannot be loaded,
+            or other machines would be served unprotected.
         LeftBehindError: at the end, when the model was still at work after the grace.
     """
+    check_exposure(settings)
+    tls = load_tls(settings)
+    tokens = None if settings.tokens is None else Tokens(settings.tokens)
     metrics = Metrics(tracing or _tracing(settings))
+    admission = Admission(tokens, metrics)
     metrics.build(version())
     health = Health(*SERVICES)
     await health.starting()
@@ -117,21 +126,28 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
         stack.push_async_callback(_close, application)
         evaluations = Evaluations(settings, metrics, work)
         stack.push_async_callback(evaluations.close)
-        calls = grpc_server(application, evaluations, health, metrics, settings)
+        calls = grpc_server(application, evaluations, health, metrics, admission, settings)
         with _port("grpc_port", settings.host, settings.grpc_port):
             # gRPC itself would not say why it cannot bind, but log on its own.
             listen(settings.host, settings.grpc_port).close()
-            grpc_port = calls.add_insecure_port(_address(settings.host, settings.grpc_port))
+            address = _address(settings.host, settings.grpc_port)
+            grpc_port = (
+                calls.add_secure_port(address, tls.grpc)
+                if tls
+                else calls.add_insecure_port(address)
+            )
         pages = HttpServer(
             http_app(
                 application,
                 evaluations,
                 health,
                 metrics,
+                admission,
                 max_body_bytes=settings.max_message_bytes,
                 version=version(),
             ),
             listener,
+            tls.http if tls else None,
         )
         await calls.start()
         stack.push_async_callback(calls.stop, _LAST_BYTES_S)
@@ -142,7 +158,9 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
         await evaluations.start()
         await health.ready()
         http_port = listener.getsockname()[1]
-        yield Service(application, evaluations, health, metrics, store, http_port, grpc_port)
+        yield Service(
+            application, evaluations, health, metrics, store, admission, http_port, grpc_port
+        )
 
 
 def _tracing(settings: Settings) -> Tracing:

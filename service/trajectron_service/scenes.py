@@ -32,6 +32,8 @@ class ForecastTask:
     """A forecast from one head, every choice made.
 
     ``step`` is the session's version, part of the key of the noise. ``agents`` None is all.
+    ``share`` (k, n) asks only for the k-th of n runs of these agents, from 0: long forecasts are
+    made in slices.
     """
 
     head: Head
@@ -43,6 +45,7 @@ class ForecastTask:
     agents: tuple[str, ...] | None
     include_modes: bool
     sampling: Sampling
+    share: tuple[int, int] = (0, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,6 +115,21 @@ class Settings(BaseSettings):
     live_accuracy_pending: Count = Field(
         2048, description="Agents whose forecasts may wait for their future, about 12 kB each."
     )
+    tls_certificate: Path | None = Field(
+        None, description="Certificate chain of both ports, PEM; plain text where unset."
+    )
+    tls_key: Path | None = Field(None, description="Its private key, PEM, unencrypted.")
+    tls_client_ca: Path | None = Field(
+        None, description="Authorities, PEM, one of which must have signed a client's certificate."
+    )
+    tokens: Path | None = Field(
+        None,
+        description="TOML file of tokens (`trajectron token new`); calls need one where it is set.",
+    )
+    insecure: bool = Field(
+        False,
+        description="Serve other machines without TLS, or without tokens or client certificates.",
+    )
 
     data: Path | None = Field(
         None,

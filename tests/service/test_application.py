@@ -115,8 +115,10 @@ async def test_agents_can_be_chosen_and_their_order_is_kept(app: Application) ->
     assert [a.id for a in some.agents] == ["cat", "ann"]
     chosen = {a.id: a for a in everyone.agents}
     for agent in some.agents:
+        whole = chosen[agent.id].samples
+        assert agent.samples is not None and whole is not None
         # Equal but for rounding, which may follow the number of rows in a product.
-        np.testing.assert_allclose(agent.samples, chosen[agent.id].samples, atol=1e-5)
+        np.testing.assert_allclose(agent.samples, whole, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from trajectron_service.commands import (
     replay,
     serve,
     simulate,
+    token,
     train,
     train_baseline,
 )
@@ -59,3 +60,4 @@ app.command()(models.models)
 app.command()(train.train)
 app.command()(train_baseline.train_baseline)
 app.command()(evaluate.evaluate)
+app.add_typer(token.token, name="token")

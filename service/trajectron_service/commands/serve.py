@@ -33,6 +33,14 @@ def serve(
         int | None,
         typer.Option(min=0, max=65535, help="50051 by default; 0 picks a free one."),
     ] = None,
+    tokens: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Who may call, see `trajectron token new --help`."),
+    ] = None,
+    insecure: Annotated[
+        bool | None,
+        typer.Option("--insecure", help="Serve other machines although nothing protects it."),
+    ] = None,
     log_level: Annotated[
         Literal["debug", "info", "warning", "error"] | None,
         typer.Option(help="`info` by default."),
@@ -63,6 +71,8 @@ def serve(
             host=host,
             http_port=http_port,
             grpc_port=grpc_port,
+            tokens=tokens,
+            insecure=insecure,
             log_level=log_level,
             log_format=log_format,
         )

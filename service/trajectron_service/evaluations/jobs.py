@@ -9,9 +9,9 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
-from trajectron_service import pages
+from trajectron_service import pages, tenancy
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
 from trajectron_service.evaluations.archive import Archive, ArchiveError
 from trajectron_service.evaluations.background import Background
@@ -37,8 +37,6 @@ from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.validation import quoted, text_fault
 from trajectron_service.work import WorkInHand, stopping
 
-# The only tenant until there are tokens.
-TENANT = "default"
 # Where the queue is full, an evaluation is ahead: they take minutes.
 _RETRY_AFTER_S = 30.0
 
@@ -166,11 +164,13 @@ class Evaluations:
         before = self._of_request(request_id, sha256)
         if before is not None:
             return before
-        if self._queue.has_record(info.id):
+        if self._queue.has_record(tenancy.current(), info.id):
             raise ServiceError(
                 ErrorKind.EVALUATION_EXISTS, f"evaluation_id: {quoted(info.id)} is taken"
             )
-        stored = StoredEvaluation(self._queue.take_number(), TENANT, info, request_id, sha256)
+        stored = StoredEvaluation(
+            self._queue.take_number(), tenancy.current(), info, request_id, sha256
+        )
         try:
             async with asyncio.timeout(self._settings.request_timeout_s):
                 await self._lay_down(stored, files)
@@ -203,7 +203,7 @@ class Evaluations:
         with self._work.taken():
             size = pages.size(page_size)
             before = _read_place(page_token)
-            older = [job for job in self._queue if job.stored.number < before]
+            older = [job for job in self._own() if job.stored.number < before]
             older.sort(key=lambda job: -job.stored.number)
             page = older[:size]
             more = len(older) > size
@@ -258,8 +258,12 @@ class Evaluations:
                     raise
                 raise _unknown(identity) from None
 
+    def _own(self) -> Iterator[Job]:
+        """The evaluations of the caller's tenant."""
+        return self._queue.of(tenancy.current())
+
     def _job(self, identity: str) -> Job:
-        job = self._queue.get(identity)
+        job = self._queue.get(tenancy.current(), identity)
         if job is None:
             raise _unknown(identity)
         return job
@@ -268,7 +272,7 @@ class Evaluations:
         """What an earlier request of this id has made."""
         if not request_id:
             return None
-        for job in self._queue:
+        for job in self._own():
             if job.stored.request_id == request_id:
                 if job.stored.request_sha256 != sha256:
                     raise invalid("request_id", "was sent before, with another request")

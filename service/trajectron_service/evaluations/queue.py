@@ -94,7 +94,7 @@ class EvaluationQueue:
         self._at_once = at_once
         self._metrics = metrics
         self._clock = clock
-        self._jobs: dict[str, Job] = {}
+        self._jobs: dict[tuple[str, str], Job] = {}  # by tenant and id
         self._numbers = itertools.count(1)
         self._running: set[Job] = set()
         self._finishing: set[asyncio.Task[Any]] = set()
@@ -106,14 +106,18 @@ class EvaluationQueue:
     def __iter__(self) -> Iterator[Job]:
         return (job for job in self._jobs.values() if not job.removed)
 
-    def get(self, identity: str) -> Job | None:
-        """An evaluation by its id, None when there is none."""
-        job = self._jobs.get(identity)
+    def of(self, tenant: str) -> Iterator[Job]:
+        """The evaluations of one tenant."""
+        return (job for job in self if job.stored.tenant == tenant)
+
+    def get(self, tenant: str, identity: str) -> Job | None:
+        """A tenant's evaluation by its id, None when there is none."""
+        job = self._jobs.get((tenant, identity))
         return None if job is None or job.removed else job
 
-    def has_record(self, identity: str) -> bool:
-        """Whether an id is taken, if only by an evaluation that is about to be deleted."""
-        return identity in self._jobs
+    def has_record(self, tenant: str, identity: str) -> bool:
+        """Whether a tenant's id is taken, if only by an evaluation that is about to be deleted."""
+        return (tenant, identity) in self._jobs
 
     @property
     def waiting(self) -> int:
@@ -131,7 +135,7 @@ class EvaluationQueue:
             StoreError: the records are damaged.
         """
         for stored in await self._archive.load():
-            self._jobs[stored.info.id] = Job(_queued_again(stored))
+            self._jobs[stored.tenant, stored.info.id] = Job(_queued_again(stored))
         last = max((job.stored.number for job in self), default=0)
         self._numbers = itertools.count(last + 1)
         for state in EvaluationState:
@@ -153,7 +157,7 @@ class EvaluationQueue:
 
     async def _add(self, stored: StoredEvaluation) -> None:
         await self._archive.add(stored)
-        self._jobs[stored.info.id] = Job(stored)
+        self._jobs[stored.tenant, stored.info.id] = Job(stored)
         self._pump()
 
     async def cancel(self, job: Job) -> None:
@@ -177,7 +181,7 @@ class EvaluationQueue:
     async def _remove(self, job: Job) -> None:
         try:
             await self._archive.remove_record(job.stored)
-            del self._jobs[job.info.id]
+            del self._jobs[job.stored.tenant, job.info.id]
         except BaseException:
             job.removed = False
             self._pump()  # it may have been passed over meanwhile

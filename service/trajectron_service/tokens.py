@@ -1,0 +1,186 @@
+"""The tokens of a file: who a bearer is, and what it may do.
+
+A token is 256 random bits; only its SHA-256 is kept. A slow hash protects secrets that can be
+guessed, such as passwords. Nobody can try 2^256 tokens however fast the hash is, and a fast one
+cannot be used to keep the service busy with wrong tokens.
+
+::
+
+    [[token]]
+    tenant = "fleet"
+    scopes = ["predict", "sessions"]
+    sha256 = "..."
+    expires = 2030-01-01T00:00:00Z   # optional
+    requests_per_s = 50              # optional
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from trajectron_service import logs
+from trajectron_service.settings import SettingsError
+from trajectron_service.tenancy import Scope
+
+_TOKEN_BYTES = 32
+_PREFIX = "trj_"
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_TENANT = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_FIELDS = frozenset({"tenant", "scopes", "sha256", "expires", "requests_per_s"})
+# How often a changed file is looked for.
+_LOOK_S = 1.0
+
+log = logs.get(__name__)
+
+
+@dataclass(frozen=True)
+class Token:
+    """One entry of the file; ``expires_at`` in Unix seconds, ``requests_per_s`` None for any."""
+
+    tenant: str
+    scopes: frozenset[Scope]
+    sha256: str
+    expires_at: float | None = None
+    requests_per_s: float | None = None
+
+
+def new_token() -> str:
+    """A token that nobody has yet."""
+    return _PREFIX + secrets.token_urlsafe(_TOKEN_BYTES)
+
+
+def digest(token: str) -> str:
+    """What is kept of a token."""
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def entry(token: str, tenant: str, scopes: list[Scope]) -> str:
+    """The lines of a token for the file.
+
+    Raises:
+        SettingsError: no such name can be a tenant's, or there are no scopes.
+    """
+    names = [scope.value for scope in scopes]
+    _parsed({"tenant": tenant, "scopes": names, "sha256": digest(token)}, "the new token")
+    listed = ", ".join(f'"{name}"' for name in names)
+    return f'[[token]]\ntenant = "{tenant}"\nscopes = [{listed}]\nsha256 = "{digest(token)}"\n'
+
+
+def read(path: Path) -> tuple[Token, ...]:
+    """The tokens of a file.
+
+    Raises:
+        SettingsError: it cannot be read or understood; the message names the entry.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SettingsError(f"tokens: cannot read {path}: {error}") from error
+    entries = table.pop("token", [])
+    if table or not isinstance(entries, list) or not entries:
+        raise SettingsError(f"tokens: {path}: must hold [[token]] entries, one at least, only")
+    tokens = tuple(
+        _parsed(fields, f"{path}, token {place}") for place, fields in enumerate(entries, 1)
+    )
+    if len({token.sha256 for token in tokens}) < len(tokens):
+        raise SettingsError(f"tokens: {path}: the same sha256 stands there twice")
+    return tokens
+
+
+class Tokens:
+    """The tokens in force: those of the file as it is now, looked at once a second at most.
+
+    A changed file that cannot be used leaves the tokens as they were, with a line in the log.
+
+    Args:
+        path: the file.
+        clock: Unix seconds, to see what has expired.
+
+    Raises:
+        SettingsError: as ``read``.
+    """
+
+    def __init__(self, path: Path, clock: Callable[[], float] = time.time) -> None:
+        self._path = path
+        self._clock = clock
+        self._stamp = _stamp(path)
+        self._tokens = read(path)
+        self._look_at = time.monotonic() + _LOOK_S
+
+    def find(self, presented: str) -> Token | None:
+        """The token presented, None when it is unknown or has expired.
+
+        All entries are compared, each in constant time: how long it takes tells nothing.
+        """
+        if time.monotonic() >= self._look_at:
+            self._look_at = time.monotonic() + _LOOK_S
+            if _stamp(self._path) != self._stamp:
+                self.reload()
+        sha256 = digest(presented)
+        found = None
+        for token in self._tokens:
+            if hmac.compare_digest(token.sha256, sha256):
+                found = token
+        if found and found.expires_at is not None and found.expires_at <= self._clock():
+            return None
+        return found
+
+    def reload(self) -> None:
+        """Reads the file again."""
+        self._stamp = _stamp(self._path)
+        try:
+            self._tokens = read(self._path)
+        except SettingsError as error:
+            log.warning("tokens not read again, the old ones hold", reason=str(error))
+        else:
+            log.info("tokens read", count=len(self._tokens))
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def _parsed(fields: Any, where: str) -> Token:
+    if not isinstance(fields, dict) or not fields.keys() <= _FIELDS:
+        raise SettingsError(f"tokens: {where}: may have {', '.join(sorted(_FIELDS))} only")
+    tenant, sha256 = fields.get("tenant"), fields.get("sha256")
+    if not isinstance(tenant, str) or not _TENANT.fullmatch(tenant):
+        raise SettingsError(
+            f"tokens: {where}: tenant must be 1 to 64 of letters, digits, '.', '_', '-'"
+        )
+    if not isinstance(sha256, str) or not _SHA256.fullmatch(sha256):
+        raise SettingsError(f"tokens: {where}: sha256 must be 64 digits of lower-case hexadecimal")
+    expires, rate = fields.get("expires"), fields.get("requests_per_s")
+    if expires is not None and not (isinstance(expires, datetime) and expires.tzinfo):
+        raise SettingsError(f"tokens: {where}: expires must be a date and time with its offset")
+    number = isinstance(rate, int | float) and not isinstance(rate, bool)
+    if rate is not None and not (number and 0.0 < rate <= 1e6):
+        raise SettingsError(f"tokens: {where}: requests_per_s must be above 0, at most 1000000")
+    return Token(
+        tenant,
+        _scopes(fields.get("scopes"), where),
+        sha256,
+        None if expires is None else expires.timestamp(),
+        rate,
+    )
+
+
+def _scopes(names: Any, where: str) -> frozenset[Scope]:
+    known = [scope.value for scope in Scope]
+    if not isinstance(names, list) or not names or any(name not in known for name in names):
+        raise SettingsError(f"tokens: {where}: scopes must list some of {', '.join(known)}")
+    return frozenset(map(Scope, names))
