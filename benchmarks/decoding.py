@@ -26,7 +26,7 @@ import torch
 
 from benchmarks.model import HORIZON, SAMPLES, scene
 from benchmarks.runtime import about
-from trajectron_model import kernels, registry
+from trajectron_model import kernels, online, registry
 from trajectron_model.decoder import Decoder
 from trajectron_model.forecast import ForecastRequest
 from trajectron_model.trajectron import Trajectron
@@ -93,7 +93,8 @@ def bfloat16_over_float32(decoder: Decoder) -> float:
 
 def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torch.dtype) -> Row:
     """One row of the table."""
-    state, _ = scene(model, agents)
+    packed, _ = scene(model, agents)
+    state = online.state_of(model, packed)
     decoder = model.node_model(0).decoder
     request = ForecastRequest(mode=mode, num_samples=SAMPLES, horizon=HORIZON)  # type: ignore[arg-type]
     rows = agents * (SAMPLES if mode == "full" else model.config.latent_values)
