@@ -251,6 +251,12 @@ class Metrics:
             "Edges, present and fading, in the sessions held in memory.",
             registry=registry,
         )
+        self.loop_lag = Gauge(
+            "trajectron_event_loop_lag_seconds",
+            "How late the last round of housekeeping began, due each second: something blocks the "
+            "event loop where this is long.",
+            registry=registry,
+        )
         self.queue_length = Gauge(
             "trajectron_queue_length", "Jobs waiting for the model.", registry=registry
         )
