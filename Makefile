@@ -11,7 +11,7 @@ INSTALLED := $(VENV)/.installed
 ARGS ?=
 KERNELS := model/trajectron_model/kernels
 
-.PHONY: help install serve test check sanitize format protos bench crash handover soak paper clean
+.PHONY: help install serve test check sanitize format protos bench crash fuzz handover soak paper clean
 
 help: ## show this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-9s %s\n", $$1, $$2}'
@@ -65,6 +65,9 @@ crash: $(INSTALLED) ## kill the service 100 times under load and look for what i
 
 handover: $(INSTALLED) ## move sessions between two replicas on one Redis, by 10 kills and 10 drains
 	$(BIN)/python -m benchmarks.handover --kills 10 --drains 10 --json benchmarks/results/handover.json $(ARGS)
+
+fuzz: $(INSTALLED) ## 20,000 hostile cases over HTTP and gRPC (some minutes)
+	$(BIN)/python scripts/fuzz.py --json benchmarks/results/fuzz.json $(ARGS)
 
 soak: $(INSTALLED) ## sessions and faults for 30 minutes: what grows, what is lost
 	$(BIN)/python -m benchmarks.soak --minutes 30 --json benchmarks/results/soak.json $(ARGS)
