@@ -123,7 +123,7 @@ def _run(arguments: argparse.Namespace, http_port: int, grpc_port: int) -> dict[
 
 def _fuzz_http(url: str, cases: int, first: int, answers: Counter[str], faults: list[str]) -> None:
     """About as many cases, shared among operations; half against the document."""
-    schema = schemathesis.openapi.from_url(f"{url}/openapi.json")
+    schema: Any = schemathesis.openapi.from_url(f"{url}/openapi.json")
     operations = [
         operation
         for operation in (result.ok() for result in schema.get_all_operations())
