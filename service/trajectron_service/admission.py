@@ -61,6 +61,11 @@ class Admission:
             raise
         tenancy.enter(token.tenant)
 
+    def reload(self) -> None:
+        """Reads the file of tokens again, where there is one."""
+        if self._tokens is not None:
+            self._tokens.reload()
+
     def _bearer(self, tokens: Tokens, authorization: str | None) -> Token:
         scheme, _, presented = (authorization or "").partition(" ")
         found = tokens.find(presented.strip()) if scheme.lower() == _SCHEME else None

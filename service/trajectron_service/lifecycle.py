@@ -88,6 +88,8 @@ async def _serve(settings: Settings) -> None:
                 models=[model.name for model in service.application.list_models()],
                 kernels=next(model.kernels for model in service.application.list_models()),
             )
+            loop = asyncio.get_running_loop()
+            loop.add_signal_handler(signal.SIGHUP, service.admission.reload)
             await stop.wait()
             log.info("draining", grace_s=settings.drain_grace_s)
         log.info("stopped")

@@ -8,6 +8,7 @@ import sys
 import trajectron_client
 
 EXPORTED = [
+    "Access",
     "Agent",
     "AgentForecast",
     "AsyncClient",

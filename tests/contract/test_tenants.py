@@ -17,6 +17,13 @@ from fastapi.routing import APIRoute
 from starlette.routing import Mount
 from tests.contract.servers import small_settings
 
+from trajectron_client import (
+    Access,
+    AsyncClient,
+    AsyncHttpClient,
+    TrajectronError,
+    TransportError,
+)
 from trajectron_proto.v1 import evaluation_pb2 as epb
 from trajectron_proto.v1 import evaluation_pb2_grpc, trajectron_pb2_grpc
 from trajectron_proto.v1 import trajectron_pb2 as pb
@@ -312,6 +319,36 @@ async def test_a_key_of_another_certificate_is_told(place: Place) -> None:
     _, key = make_certificate(place.folder, "other")
     with pytest.raises(SettingsError, match="no certificate with its"):
         load_tls(Settings(tls_certificate=place.ca, tls_key=key))
+
+
+async def test_the_clients_show_their_token_and_trust_the_authority(place: Place) -> None:
+    access = Access(token=TOKENS["ann"], ca=place.ca)
+    assert TOKENS["ann"] not in repr(access)
+    target = f"localhost:{place.service.grpc_port}"
+    url = f"https://localhost:{place.service.http_port}"
+    async with AsyncClient(target, access=access) as grpc_client:
+        assert await grpc_client.list_models()
+    async with AsyncHttpClient(url, access=access) as http_client:
+        assert await http_client.list_models()
+    async with AsyncHttpClient(url, access=Access(ca=place.ca)) as nobody:
+        with pytest.raises(TrajectronError):
+            await nobody.list_models()
+    async with AsyncHttpClient(url, access=Access(token=TOKENS["ann"])) as trusts_nobody:
+        with pytest.raises(TransportError):
+            await trusts_nobody.list_models()
+
+
+async def test_access_comes_from_the_environment(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRAJECTRON_CLIENT_TOKEN", TOKENS["bob"])
+    monkeypatch.setenv("TRAJECTRON_CLIENT_CA", str(place.ca))
+    access = Access.from_environment()
+    assert access == Access(token=TOKENS["bob"], ca=place.ca)
+    async with AsyncClient(f"localhost:{place.service.grpc_port}", access=access) as client:
+        assert await client.list_models()
+    with pytest.raises(ValueError, match="go together"):
+        Access(certificate=place.ca)
 
 
 async def test_with_client_certificates_none_else_gets_in(place: Place, model_path: Path) -> None:

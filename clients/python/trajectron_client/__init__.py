@@ -14,6 +14,7 @@
 Positions are metres in your own world-fixed frame, times seconds on your own clock.
 """
 
+from trajectron_client.access import Access
 from trajectron_client.async_calls import AsyncSession
 from trajectron_client.async_streams import AsyncStream
 from trajectron_client.evaluations import (
@@ -85,6 +86,7 @@ from trajectron_client.streams import Stream
 from trajectron_client.sync_calls import Session
 
 __all__ = [
+    "Access",
     "Agent",
     "AgentForecast",
     "AsyncClient",

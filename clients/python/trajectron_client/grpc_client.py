@@ -14,6 +14,7 @@ import grpc
 from grpc_health.v1 import health_pb2
 
 from trajectron_client import evaluations, operations, protobuf
+from trajectron_client.access import Access
 from trajectron_client.async_calls import AsyncCalls
 from trajectron_client.async_streams import AsyncCall, AsyncStream
 from trajectron_client.connections import Connections, Route, elsewhere
@@ -49,7 +50,8 @@ class Client(SyncCalls):
         target: ``host:port`` of the service, or of each of its replicas: one is used until it
             fails or stops, then the next.
         timeout_s: for calls that bring none of their own; None for as long as it takes.
-        credentials: for TLS; plain text when None.
+        access: token and certificates for a protected service.
+        credentials: for TLS, in place of those of ``access``.
         metadata: sent with every call.
         reconnect_for_s: how long a stream tries to go on after its connection broke; 0 for not at
             all.
@@ -61,13 +63,16 @@ class Client(SyncCalls):
         target: str | Sequence[str] = "127.0.0.1:50051",
         *,
         timeout_s: float | None = 10.0,
+        access: Access | None = None,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Metadata = (),
         reconnect_for_s: float = 60.0,
         options: Sequence[tuple[str, Any]] = (),
     ) -> None:
         self._timeout_s = timeout_s
-        self._metadata = tuple(metadata)
+        access = access or Access()
+        credentials = credentials or access.credentials()
+        self._metadata = (*access.metadata, *metadata)
         self._reconnect_for_s = reconnect_for_s
 
         def connect(address: str, merged: list[tuple[str, Any]]) -> grpc.Channel:
@@ -215,7 +220,8 @@ class AsyncClient(AsyncCalls):
         target: ``host:port`` of the service, or of each of its replicas: one is used until it
             fails or stops, then the next.
         timeout_s: for calls that bring none of their own; None for as long as it takes.
-        credentials: for TLS; plain text when None.
+        access: token and certificates for a protected service.
+        credentials: for TLS, in place of those of ``access``.
         metadata: sent with every call.
         reconnect_for_s: how long a stream tries to go on after its connection broke; 0 for not at
             all.
@@ -230,6 +236,7 @@ class AsyncClient(AsyncCalls):
         target: str | Sequence[str] = "127.0.0.1:50051",
         *,
         timeout_s: float | None = 10.0,
+        access: Access | None = None,
         credentials: grpc.ChannelCredentials | None = None,
         metadata: Metadata = (),
         reconnect_for_s: float = 60.0,
@@ -237,7 +244,9 @@ class AsyncClient(AsyncCalls):
     ) -> None:
         asyncio.get_running_loop()  # gRPC binds a channel to a loop when it is made
         self._timeout_s = timeout_s
-        self._metadata = tuple(metadata)
+        access = access or Access()
+        credentials = credentials or access.credentials()
+        self._metadata = (*access.metadata, *metadata)
         self._reconnect_for_s = reconnect_for_s
 
         def connect(address: str, merged: list[tuple[str, Any]]) -> grpc.aio.Channel:

@@ -14,6 +14,7 @@ import httpx
 from httpx_sse import SSEError, aconnect_sse, connect_sse
 
 from trajectron_client import http_errors, http_events
+from trajectron_client.access import Access
 from trajectron_client.async_calls import AsyncCalls
 from trajectron_client.evaluation_operations import path
 from trajectron_client.evaluations import Evaluation
@@ -38,6 +39,7 @@ class HttpClient(SyncCalls):
         base_url: where the service answers.
         timeout_s: for calls that bring none of their own: how long connecting may take, and how
             long any wait for the answer; None for as long as it takes.
+        access: token and certificates for a protected service.
         headers: sent with every call.
         transport: your own httpx transport, for TLS settings or proxies.
     """
@@ -47,14 +49,17 @@ class HttpClient(SyncCalls):
         base_url: str = "http://127.0.0.1:8000",
         *,
         timeout_s: float | None = 10.0,
+        access: Access | None = None,
         headers: Mapping[str, str] | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout_s = timeout_s
+        access = access or Access()
+        verify = access.ssl_context() if base_url.startswith("https:") else True
         self._http = httpx.Client(
             base_url=base_url,
-            headers=headers,
-            transport=transport or httpx.HTTPTransport(retries=_CONNECT_RETRIES),
+            headers={**access.headers, **(headers or {})},
+            transport=transport or httpx.HTTPTransport(verify=verify, retries=_CONNECT_RETRIES),
         )
 
     def close(self) -> None:
@@ -117,6 +122,7 @@ class AsyncHttpClient(AsyncCalls):
         base_url: where the service answers.
         timeout_s: for calls that bring none of their own: how long connecting may take, and how
             long any wait for the answer; None for as long as it takes.
+        access: token and certificates for a protected service.
         headers: sent with every call.
         transport: your own httpx transport, for TLS settings or proxies.
     """
@@ -126,14 +132,18 @@ class AsyncHttpClient(AsyncCalls):
         base_url: str = "http://127.0.0.1:8000",
         *,
         timeout_s: float | None = 10.0,
+        access: Access | None = None,
         headers: Mapping[str, str] | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout_s = timeout_s
+        access = access or Access()
+        verify = access.ssl_context() if base_url.startswith("https:") else True
         self._http = httpx.AsyncClient(
             base_url=base_url,
-            headers=headers,
-            transport=transport or httpx.AsyncHTTPTransport(retries=_CONNECT_RETRIES),
+            headers={**access.headers, **(headers or {})},
+            transport=transport
+            or httpx.AsyncHTTPTransport(verify=verify, retries=_CONNECT_RETRIES),
         )
 
     async def close(self) -> None:

@@ -88,13 +88,14 @@ def load(
 
 
 async def _send(plan: LoadPlan, server: str, http: str | None) -> LoadReport:
-    from trajectron_client import AsyncClient, AsyncHttpClient
+    from trajectron_client import Access, AsyncClient, AsyncHttpClient
     from trajectron_service.commands.loading import send_over_grpc, send_over_http
 
+    access = Access.from_environment()
     if http is None:
-        async with AsyncClient(server) as client:
+        async with AsyncClient(server, access=access) as client:
             return await send_over_grpc(client, plan)
-    async with AsyncHttpClient(http) as caller:
+    async with AsyncHttpClient(http, access=access) as caller:
         return await send_over_http(caller, plan)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from trajectron_client import (
+    Access,
     Agent,
     AsyncClient,
     Forecast,
@@ -53,7 +54,7 @@ class Playback:
         self, target: str, session: str | None, config: SessionOptions, options: ForecastOptions
     ) -> None:
         """Streams everything; raises what the client raises."""
-        async with AsyncClient(target) as client:
+        async with AsyncClient(target, access=Access.from_environment()) as client:
             stream = client.stream(
                 self._frames(),
                 session_id=session,
