@@ -34,13 +34,14 @@ serve: $(INSTALLED) ## start the service on 127.0.0.1 (HTTP 8000, gRPC 50051); A
 test: $(INSTALLED) ## run the tests, a process to each core; ARGS="-k name" for some
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
 
-check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentation links
+check: $(INSTALLED) ## format, lint, types, import contracts, protos, documentation links, known weaknesses
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python scripts/protos.py --check
 	$(BIN)/python scripts/links.py
+	$(BIN)/python scripts/audit.py
 
 format: $(INSTALLED) ## format the code and mend what the linter can
 	$(BIN)/ruff format .

@@ -306,13 +306,11 @@ async def test_who_does_not_trust_the_certificate_does_not_talk(place: Place) ->
             await http.get(url.replace("https", "http"))
 
 
-async def test_old_tls_is_refused(place: Place) -> None:
-    context = ssl.create_default_context(cafile=place.ca)
-    context.set_ciphers("DEFAULT@SECLEVEL=0")
-    context.minimum_version = context.maximum_version = ssl.TLSVersion.TLSv1_1
-    async with httpx.AsyncClient(verify=context) as http:
-        with pytest.raises(httpx.ConnectError):
-            await http.get(f"https://localhost:{place.service.http_port}/healthz")
+async def test_nothing_older_than_tls_1_2_is_spoken(place: Place) -> None:
+    certificate, key = make_certificate(place.folder, "modern")
+    tls = load_tls(Settings(tls_certificate=certificate, tls_key=key))
+    assert tls is not None
+    assert tls.http.minimum_version >= ssl.TLSVersion.TLSv1_2
 
 
 async def test_a_key_of_another_certificate_is_told(place: Place) -> None:
