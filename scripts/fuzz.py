@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -256,10 +257,8 @@ async def _call(channel: Any, method: MethodDescriptor, requests: list[bytes]) -
     try:
         async with asyncio.timeout(_TIMEOUT_S):
             if method.client_streaming:
-                call: Any = channel.stream_stream(path)(iter(requests), timeout=_TIMEOUT_S)
-                async for _ in call:
-                    pass
-            elif method.server_streaming:
+                return await _stream(channel.stream_stream(path)(timeout=_TIMEOUT_S), requests)
+            if method.server_streaming:
                 call = channel.unary_stream(path)(requests[0], timeout=_TIMEOUT_S)
                 async for _ in call:
                     pass
@@ -270,6 +269,21 @@ async def _call(channel: Any, method: MethodDescriptor, requests: list[bytes]) -
     except TimeoutError:
         return "TIMEOUT"
     return "OK"
+
+
+async def _stream(call: Any, requests: list[bytes]) -> str:
+    """The status that the server ended a stream with.
+
+    Writing to a stream that has ended raises an INTERNAL of gRPC's own making on this side.
+    """
+    with contextlib.suppress(grpc.RpcError, asyncio.InvalidStateError):
+        for request in requests:
+            await call.write(request)
+        await call.done_writing()
+    with contextlib.suppress(grpc.RpcError):
+        while await call.read() is not grpc.aio.EOF:
+            pass
+    return str((await call.code()).name)
 
 
 if __name__ == "__main__":
