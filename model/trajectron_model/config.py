@@ -219,6 +219,8 @@ class ModelConfig:
             raise ValueError(f"model settings do not fit: {error}") from error
 
 
-def _node_type(values: Mapping[str, Any]) -> NodeType:
+def _node_type(values: object) -> NodeType:
+    if not isinstance(values, Mapping):
+        raise TypeError(f"a type is {type(values).__name__}, not an object")
     dispersion = tuple(Dispersion(*step) for step in values.get("dispersion", ()))
     return NodeType(**{**values, "dispersion": dispersion})

@@ -402,3 +402,27 @@ async def test_the_examples_of_the_documentation_work(http: httpx.AsyncClient) -
     [example] = schemas["PredictSessionRequest"]["examples"]
     assert (await http.post(f"{path}:predict", json=example)).status_code == 200
     assert (await http.delete(path)).status_code == 204
+
+
+@pytest.mark.parametrize(
+    ("charset", "text", "status"),
+    [
+        # Decodes to a lone surrogate, which no answer can hold.
+        ("utf-7", b"+2AA-", 400),
+        # Raises an error of its own, after a time quadratic in the text.
+        ("punycode", b"xn--a.", 400),
+        ("utf-16", b"{}", 400),
+        # As it is without a charset: the JSON is read, and lacks its models.
+        ("UTF-8", b"{}", 422),
+    ],
+)
+async def test_forms_are_utf_8(
+    http: httpx.AsyncClient, charset: str, text: bytes, status: int
+) -> None:
+    part = b'--B\r\nContent-Disposition: form-data; name="evaluation"\r\n\r\n'
+    answer = await http.post(
+        "/v1/evaluations",
+        content=part + text + b"\r\n--B--\r\n",
+        headers={"content-type": f"multipart/form-data; boundary=B; charset={charset}"},
+    )
+    assert answer.status_code == status, answer.text

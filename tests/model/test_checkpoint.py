@@ -130,6 +130,13 @@ def test_settings_that_cannot_be_are_refused_before_anything_is_built(
         Checkpoint.load(saved)
 
 
+@pytest.mark.parametrize("types", [["pedestrian"], [["pedestrian"]], [None], [3], "pedestrian", {}])
+def test_types_that_are_no_types_are_refused(saved: Path, model: Trajectron, types: object) -> None:
+    rewrite(saved, model={**model.config.to_json(), "types": types})
+    with pytest.raises(CheckpointError):
+        describe(saved)
+
+
 def test_bottomless_json_is_refused(saved: Path) -> None:
     beside(saved, ".json").write_text("[" * 200_000)
     with pytest.raises(CheckpointError, match="not the JSON of a checkpoint"):
