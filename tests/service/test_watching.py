@@ -140,7 +140,8 @@ def assert_same_as_offline(
             labels = kind | {"point": point}
             assert value(app, f"{name}_meters_count", **labels) == agents
             mean = value(app, f"{name}_meters_sum", **labels) / agents
-            assert mean == pytest.approx(columns[f"{name}_{point}"].mean(), rel=1e-5)
+            # Here a kernel makes the steps, there torch: equal as DESIGN's rule has it.
+            assert mean == pytest.approx(columns[f"{name}_{point}"].mean(), rel=1e-4)
     for step in range(1, HORIZON + 1):
         labels = kind | {"step": step}
         count = value(app, "steps_total", **labels)
@@ -155,7 +156,7 @@ def assert_same_as_offline(
             means[f"coverage_{region}"] = value(app, "covered_total", region=region, **labels)
         for name, total in means.items():
             expected = mean_over_known(columns[name], axis=0)[step - 1]
-            assert total / count == pytest.approx(expected, rel=1e-5, abs=1e-5), (name, step)
+            assert total / count == pytest.approx(expected, rel=1e-4, abs=1e-5), (name, step)
 
 
 @pytest.mark.parametrize("mode", [ForecastMode.FULL, ForecastMode.GMM])

@@ -23,7 +23,10 @@ TrajectronError
     │   ├── TooManySessionsError
     │   ├── TooManyEvaluationsError
     │   ├── TooLargeError
+    │   ├── RateLimitedError        the token's calls a second are used up; ``retry_after_s``
     │   └── OverloadedError         the queue is full; see ``retry_after_s``
+    ├── UnauthenticatedError        a valid token is required
+    ├── PermissionDeniedError       the token lacks the scope that the call needs
     ├── SessionDamagedError         what was stored of the session cannot be read any more
     ├── StoreUnavailableError       sessions cannot be stored now; ``retry_after_s``
     ├── DrainingError               the server is stopping; another replica may answer
@@ -162,6 +165,18 @@ class OverloadedError(ResourceExhaustedError):
     """The server's queue is full; ``retry_after_s`` says when to try again."""
 
 
+class RateLimitedError(ResourceExhaustedError):
+    """The token's calls a second are used up; ``retry_after_s`` says when there is another."""
+
+
+class UnauthenticatedError(ServiceError):
+    """A valid token is required: none was sent, or it is unknown or has expired."""
+
+
+class PermissionDeniedError(ServiceError):
+    """The token lacks the scope that the call needs."""
+
+
 class SessionDamagedError(ServiceError):
     """What the service had stored of the session cannot be read; it is kept aside there."""
 
@@ -204,6 +219,9 @@ BY_REASON: dict[str, type[ServiceError]] = {
     "TOO_MANY_EVALUATIONS": TooManyEvaluationsError,
     "TOO_MANY_SESSIONS": TooManySessionsError,
     "TOO_LARGE": TooLargeError,
+    "RATE_LIMITED": RateLimitedError,
+    "UNAUTHENTICATED": UnauthenticatedError,
+    "PERMISSION_DENIED": PermissionDeniedError,
     "OVERLOADED": OverloadedError,
     "DRAINING": DrainingError,
     "STORE_UNAVAILABLE": StoreUnavailableError,
