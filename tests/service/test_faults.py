@@ -139,3 +139,10 @@ def test_every_test_that_the_table_of_faults_names_exists() -> None:
     assert len(named) > 15
     for file, test in named:
         assert re.search(rf"def {test}\(", (ROOT / file).read_text()), f"{file}::{test}"
+
+
+def test_every_metric_that_the_table_of_faults_names_exists() -> None:
+    page, listed = ((ROOT / "docs" / name).read_text() for name in ("faults.md", "metrics.md"))
+    named = set(re.findall(r"`(trajectron_\w+)", page))
+    assert len(named) > 8
+    assert named <= set(re.findall(r"^\| `(trajectron_\w+)`", listed, re.MULTILINE))

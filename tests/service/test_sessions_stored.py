@@ -113,8 +113,12 @@ class Faulty(MemoryStore):
             raise StoreError("away")
 
 
-async def test_without_its_store_it_reads_what_is_in_memory_and_refuses_to_write() -> None:
+@pytest.mark.parametrize("shared", [False, True])
+async def test_without_its_store_it_reads_what_is_in_memory_and_refuses_to_write(
+    shared: bool,
+) -> None:
     store = Faulty(durable=True)
+    store.shared = shared
     house = House(store)
     await house.sessions.create(KEY, record())
     assert await house.observe() == 1
