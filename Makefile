@@ -56,6 +56,8 @@ protos: $(INSTALLED) ## generate the code of the contract and lint it
 bench: $(INSTALLED) ## time the model beside its bare matrix products, then the service around it
 	$(BIN)/python benchmarks/model.py --threads 1 --json benchmarks/results/model-1-thread.json
 	$(BIN)/python benchmarks/model.py --threads 2 --json benchmarks/results/model-2-threads.json
+	$(BIN)/python -m benchmarks.step --threads 1 --json benchmarks/results/step-1-thread.json
+	$(BIN)/python -m benchmarks.step --threads 2 --json benchmarks/results/step-2-threads.json
 	$(BIN)/python -m benchmarks.decoding --threads 1 --check --json benchmarks/results/decoding-1-thread.json
 	$(BIN)/python -m benchmarks.decoding --threads 2 --check --json benchmarks/results/decoding-2-threads.json
 	$(BIN)/python -m benchmarks.service --json benchmarks/results/service.json

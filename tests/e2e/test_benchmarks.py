@@ -35,6 +35,25 @@ def test_the_model_benchmark_sets_ours_beside_the_bare_products(
     assert "| sampling_200x12 | 3 |" in capsys.readouterr().out
 
 
+def test_the_benchmark_of_steps_sets_ours_beside_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from benchmarks import step
+
+    monkeypatch.setattr(step, "AGENTS", (1, 3, 5, 8, 10, 12))
+    monkeypatch.setattr(step, "CROWDS", (5, 10))
+    monkeypatch.setattr(step, "MANY_SCENES", 4)
+    out = tmp_path / "step.json"
+    monkeypatch.setattr(sys, "argv", ["", "--threads", "1", "--repeats", "1", "--json", str(out)])
+    step.main()
+    figures = json.loads(out.read_text())
+    steps = [row for row in figures["rows"] if row["what"] == "step"]
+    assert [row["agents"] for row in steps] == [1, 3, 5, 8, 10, 12]
+    assert all(set(row["times"]) == {"torch", "bare products"} for row in steps)
+    assert figures["bytes_of_a_scene"]["12"] > figures["bytes_of_a_scene"]["1"] > 0
+    assert "| step of 4 scenes | 20 |" in capsys.readouterr().out
+
+
 def test_the_benchmark_of_the_service_measures_every_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

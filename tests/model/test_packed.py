@@ -73,7 +73,12 @@ def assert_same(scene: PackedScene, state: SceneState, model: Trajectron) -> Non
 
 
 @needs_kernels
-@pytest.mark.parametrize("config", [ModelConfig(), MIXED], ids=["one type", "three types"])
+@pytest.mark.parametrize(
+    "config",
+    # Sizes that fill neither vectors nor blocks of them.
+    [ModelConfig(), MIXED, ModelConfig(history_size=13, edge_size=3)],
+    ids=["one type", "three types", "odd sizes"],
+)
 @pytest.mark.parametrize("agents", [1, 7, 90])
 def test_streamed_by_the_kernel_a_recording_is_the_fold_of_steps(
     config: ModelConfig, agents: int

@@ -10,6 +10,7 @@
 
 #define NODE_FEATURES 8
 #define NEIGHBOUR_FEATURES 10
+#define GATE_VECTORS 8 /* sums that hide the time of an addition, in registers */
 #define FEW 48 /* below that many agents all pairs are looked at */
 
 /* What comes before the numbers whose count depends on the model; packed.py has the same. */
@@ -246,21 +247,39 @@ static void features_of(const Model *model, const Node *node, float *out) {
     out[7] = node->heading_known != 0;
 }
 
+/* gates += [in; hidden] times columns of weights, `vectors` of them, kept in registers. */
+INLINE void add_products(const int vectors, int64_t size, int64_t depth, const float *weight,
+                         const float *in, const float *hidden, float *gates) {
+    vf held[GATE_VECTORS];
+    int64_t width = 4 * size;
+#pragma GCC unroll 8
+    for (int v = 0; v < vectors; v++) held[v] = vf_load(gates + v * LANES);
+    for (int64_t k = 0; k < depth + size; k++, weight += width) {
+        vf value = vf_all(k < depth ? in[k] : hidden[k - depth]);
+#pragma GCC unroll 8
+        for (int v = 0; v < vectors; v++) held[v] += value * vf_load(weight + v * LANES);
+    }
+#pragma GCC unroll 8
+    for (int v = 0; v < vectors; v++) vf_store(gates + v * LANES, held[v]);
+}
+
 /* One LSTM cell of a row; gates in torch's order: input, forget, new, output.
  *
  * weight: [depth + size][4 size], first what comes in, then the hidden state.
  */
 static void lstm_cell(int64_t size, int64_t depth, const float *weight, const float *bias,
                       const float *in, float *hidden, float *cell, float *gates) {
-    int64_t width = 4 * size;
+    int64_t width = 4 * size, at = 0;
     memcpy(gates, bias, (size_t)width * sizeof *gates);
-    for (int64_t k = 0; k < depth + size; k++, weight += width) {
-        float value = k < depth ? in[k] : hidden[k - depth];
-        int64_t at = 0;
-        for (; at + LANES <= width; at += LANES)
-            vf_store(gates + at, vf_load(gates + at) + vf_all(value) * vf_load(weight + at));
-        for (; at < width; at++) gates[at] += value * weight[at];
-    }
+    for (; at + GATE_VECTORS * LANES <= width; at += GATE_VECTORS * LANES)
+        add_products(GATE_VECTORS, size, depth, weight + at, in, hidden, gates + at);
+    for (; at + 4 * LANES <= width; at += 4 * LANES)
+        add_products(4, size, depth, weight + at, in, hidden, gates + at);
+    for (; at + LANES <= width; at += LANES)
+        add_products(1, size, depth, weight + at, in, hidden, gates + at);
+    for (; at < width; at++)
+        for (int64_t k = 0; k < depth + size; k++)
+            gates[at] += (k < depth ? in[k] : hidden[k - depth]) * weight[k * width + at];
     for (int64_t first = 0; first < size; first += LANES) {
         int64_t here = size - first < LANES ? size - first : LANES;
         size_t bytes = (size_t)here * sizeof(float);
