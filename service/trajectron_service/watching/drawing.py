@@ -20,8 +20,8 @@ def mixture_drawer(engine: SceneEngine, record: SceneRecord) -> Draw:
     def draw(agents: tuple[str, ...]) -> tuple[AgentForecast, ...]:
         task = ForecastTask(
             head=head(record.timeline),
-            mode=ForecastMode.GMM,
-            num_samples=1,  # none are drawn
+            mode=ForecastMode.FULL,
+            num_samples=1,  # `gmm`, which draws none, would leave modes out
             horizon=engine.models[record.model].info.horizon,
             seed=0,
             step=record.version,
