@@ -19,6 +19,7 @@ from tests.process import Served, environment
 
 from trajectron_model.data.readers import read
 from trajectron_service.cli import main
+from trajectron_service.commands.options import out
 from trajectron_service.http_answers import Forecast, Models
 
 COMMANDS = ("serve", "predict", "replay", "simulate", "models", "train", "evaluate")
@@ -282,8 +283,12 @@ def test_wrong_use_is_one_clear_line_and_exit_code_2(
     assert "Traceback" not in out + err
 
 
-def test_bundled_models_are_listed_with_their_figures(cli: Cli) -> None:
+@pytest.mark.parametrize("columns", [80, 200])
+def test_bundled_models_are_listed_with_their_figures(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
     """On validation data all of them, on a test set those that were kept from one."""
+    monkeypatch.setattr(type(out), "width", columns)
     lines = cli("models").splitlines()
     rows = {line.split()[0]: line for line in lines if line.strip().startswith("eth_ucy")}
     assert len(rows) == 6 and len(re.findall(r"\d\.\d{3}/\d\.\d{3}", rows["eth_ucy*"])) == 1

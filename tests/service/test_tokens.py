@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,14 @@ from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import Tokens, digest, entry, new_token
 
 FLEET = new_token()
+
+
+@pytest.fixture(autouse=True)
+def _tenant_of_this_test_only() -> Iterator[None]:
+    """Whoever is admitted here is not whom the tests after these work for."""
+    before = tenancy._tenant.set(tenancy.current())
+    yield
+    tenancy._tenant.reset(before)
 
 
 @pytest.fixture

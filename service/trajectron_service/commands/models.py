@@ -10,6 +10,7 @@ import typer
 from trajectron_service.commands.options import out
 from trajectron_service.messages import ModelInfo
 
+_TABLE_WIDTH = 120
 _HASH_LETTERS = 8
 _JUDGED_SAMPLES = 20
 
@@ -71,6 +72,7 @@ def _print_json(infos: Sequence[ModelInfo]) -> None:
 
 def _print_table(infos: Sequence[ModelInfo]) -> None:
     from rich.box import SIMPLE_HEAD
+    from rich.console import Console
     from rich.table import Table
 
     table = Table(
@@ -78,9 +80,7 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
         caption="*: the default. ADE/FDE: best of 20 samples per agent, metres.",
         caption_justify="left",
     )
-    # A name cut short on a narrow screen could be any of several.
-    table.add_column("model", no_wrap=True, min_width=max(len(info.name) for info in infos) + 1)
-    for column in ("steps", "modes", "validation", "test", "sha256"):
+    for column in ("model", "steps", "modes", "validation", "test", "sha256"):
         table.add_column(column, no_wrap=True)
     for column in ("agents", "trained on"):
         table.add_column(column, min_width=14)
@@ -95,7 +95,8 @@ def _print_table(infos: Sequence[ModelInfo]) -> None:
             ", ".join(info.agent_types),
             ", ".join(_recordings(info.provenance)) or "not said",
         )
-    out.print(table)
+    # On a narrower screen lines wrap: names and figures cut short could be any of several.
+    Console(width=max(out.width, _TABLE_WIDTH), soft_wrap=True).print(table)
 
 
 def _validation_figures(provenance: Mapping[str, object]) -> str:
