@@ -8,35 +8,46 @@
  * Nothing is added up over rows and every row takes the same path through the same instructions,
  * so a row's result is the same to the last bit whatever stands beside it.
  */
+#include <stdbool.h>
+
 #include "simd.h"
 
 #define BLOCK_ROWS 48 /* a multiple of 2 * TILE_ROWS and of LANES, for every instruction set */
 #define LOGIT_VECTORS 2
 #define LOGIT_ROWS (2 * TILE_ROWS)
 #define CORRELATION_BOUND 0.98f
-/* Gates are held to this: a sigmoid beyond it differs from 0 or 1 by less than 1e-13. */
-#define GATE_BOUND 30.0f
+/* Gates are kept as powers of two: of i, f and o the negative over ln 2, of the new value twice
+ * over ln 2. They are held to this: a sigmoid beyond it differs from 0 or 1 by less than 1e-12. */
+#define GATE_BOUND 40.0f
+#define LOG2_E 1.44269504f
+static const float GATE_SCALE[4] = {-LOG2_E, -LOG2_E, -LOG2_E, 2.0f * LOG2_E};
 
 _Static_assert(BLOCK_ROWS % LOGIT_ROWS == 0 && BLOCK_ROWS % LANES == 0, "whole tiles");
 
-/* As in decoding.py. Sizes in floats; units, components, logits and outputs are padded with
- * weights of zero to whole vectors or panels. */
+/* As in decoding.py. Sizes in numbers; units, components, logits and outputs are padded with
+ * weights of zero to whole vectors or panels. Products with hidden states are made in integers
+ * (fixed_tile): each output has the scale that makes its sum a float again. */
 typedef struct {
     int64_t size;       /* hidden units */
-    int64_t units;      /* the same, padded to LANES */
+    int64_t units;      /* the same, padded to 2 * LANES */
     int64_t components; /* of the mixture */
     int64_t padded;     /* the same, padded to LANES */
     int64_t logits;     /* the same, padded to LOGIT_VECTORS * LANES */
     int64_t outputs;    /* 6 * padded, padded to PANEL_COLUMNS */
-    const float *recurrent;    /* [units / LANES][units + 2][4][LANES]: gates i, f, o, new */
-    const float *gates_latent; /* [Z][4 * size] */
-    const float *start_latent; /* [Z][2 * size] */
-    const float *logit_weight; /* [logits / (2 LANES)][units][2][LANES] */
-    const float *logit_bias;   /* [logits] */
-    const float *chosen_weight; /* [components][5][units] */
-    const float *chosen_bias;   /* [components][5] */
-    const float *head_weight;   /* [outputs / PANEL_COLUMNS][units][4][LANES]: six kinds */
-    const float *head_bias;     /* [outputs], weight logits of padding far below all others */
+    const int16_t *recurrent;        /* [units / LANES][units / 2][4][LANES][2]: i, f, o, new */
+    const float *recurrent_scale;    /* [units / LANES][4][LANES], times GATE_SCALE */
+    const float *recurrent_velocity; /* [units / LANES][2][4][LANES]: of the last velocity, too */
+    const float *gates_latent;       /* [Z][units / LANES][4][LANES], too */
+    const float *start_latent;       /* [Z][2][units] */
+    const int16_t *logit_weight;     /* [logits / (2 LANES)][units / 2][2][LANES][2] */
+    const float *logit_scale;        /* [logits] */
+    const float *logit_bias;         /* [logits] */
+    const int16_t *chosen_weight;    /* [components][5][units] */
+    const float *chosen_scale;       /* [components][5] */
+    const float *chosen_bias;        /* [components][5] */
+    const int16_t *head_weight;      /* [outputs / PANEL_COLUMNS][units / 2][4][LANES][2] */
+    const float *head_scale;         /* [outputs] */
+    const float *head_bias;          /* [outputs], weight logits of padding far below all others */
     float log_sigma_min, log_sigma_span;
 } Decoder;
 
@@ -51,57 +62,62 @@ typedef struct {
     float limit; /* on speed */
 } Rollouts;
 
-/* What a block works on. A row of `hidden` is [h; y]: hidden state and last velocity. */
+/* What a block works on. */
 typedef struct {
-    long stride;
-    float *hidden, *next, *cell;          /* [BLOCK_ROWS][stride] */
-    float *gates;                         /* [BLOCK_ROWS starts][4 * units], panel by panel */
-    float *start_hidden, *start_cell;     /* [BLOCK_ROWS starts][stride] */
-    float *raw;                           /* [BLOCK_ROWS][outputs] */
-    float *edges;                         /* [components][LANES] */
-    float chosen[5][BLOCK_ROWS], velocity[2][BLOCK_ROWS];
+    long units;
+    int16_t *hidden, *next, *start_hidden; /* [BLOCK_ROWS][units] hidden states, fixed point */
+    float *cell, *start_cell;              /* [BLOCK_ROWS][units] */
+    float *gates;                          /* [BLOCK_ROWS starts][4 * units], panel by panel */
+    float *own_gates, *own_start;          /* [4 * units], [2][units]: of one agent */
+    float *raw;                            /* [BLOCK_ROWS][outputs] */
+    float *edges;                          /* [components][LANES] */
+    float chosen[5][BLOCK_ROWS], velocity[2][BLOCK_ROWS], start_velocity[2][BLOCK_ROWS];
     float uniform[BLOCK_ROWS], normal[2][BLOCK_ROWS];
     int64_t row[BLOCK_ROWS];
     const float *start_of[BLOCK_ROWS]; /* each row's gates */
     int64_t start_index[BLOCK_ROWS];
 } Block;
 
-static long stride_of(const Decoder *decoder) { return decoder->units + LANES; }
-
 /* Bytes that a call needs to work in. */
 KERNEL int64_t trajectron_decode_workspace(const Decoder *decoder) {
-    int64_t floats = BLOCK_ROWS * (5 * stride_of(decoder) + 4 * decoder->units + decoder->outputs);
-    floats += decoder->components * LANES;
-    return (int64_t)sizeof(Block) + 64 + floats * (int64_t)sizeof(float);
+    int64_t floats = BLOCK_ROWS * (6 * decoder->units + decoder->outputs);
+    floats += 6 * decoder->units + decoder->components * LANES;
+    int64_t fixed = BLOCK_ROWS * 3 * decoder->units;
+    return (int64_t)sizeof(Block) + 64 + floats * (int64_t)sizeof(float) +
+           fixed * (int64_t)sizeof(int16_t);
 }
 
 static Block *block_in(void *workspace, const Decoder *decoder) {
     Block *block = workspace;
     uintptr_t after = ((uintptr_t)(block + 1) + 63) & ~(uintptr_t)63;
-    float *next = (float *)after;
-    long stride = stride_of(decoder);
-    float **arrays[] = {&block->hidden, &block->next, &block->cell, &block->start_hidden,
-                        &block->start_cell};
-    for (int i = 0; i < 5; i++, next += BLOCK_ROWS * stride) *arrays[i] = next;
-    block->gates = next;
-    block->raw = next + BLOCK_ROWS * 4 * decoder->units;
+    const long units = decoder->units;
+    block->units = units;
+    block->cell = (float *)after;
+    block->start_cell = block->cell + BLOCK_ROWS * units;
+    block->gates = block->start_cell + BLOCK_ROWS * units;
+    block->own_gates = block->gates + BLOCK_ROWS * 4 * units;
+    block->own_start = block->own_gates + 4 * units;
+    block->raw = block->own_start + 2 * units;
     block->edges = block->raw + BLOCK_ROWS * decoder->outputs;
-    block->stride = stride;
+    block->hidden = (int16_t *)(block->edges + decoder->components * LANES);
+    block->next = block->hidden + BLOCK_ROWS * units;
+    block->start_hidden = block->next + BLOCK_ROWS * units;
     return block;
 }
 
-/* The cells of LANES hidden units of one row: gates i, f, o and new as they leave the product. */
-INLINE void close_cell(const float *gates, float *cell, float *next) {
+/* The cells of LANES hidden units of one row, from gates i, f, o and new as powers of two: the new
+ * hidden states. */
+INLINE vf close_cell(const float *gates, float *cell) {
     /* sigmoid(f) c + sigmoid(i) tanh(new), over a common denominator: divisions are slow */
-    vf i = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates), GATE_BOUND));
-    vf f = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates + LANES), GATE_BOUND));
-    vf o = 1.0f + vf_exp_within(-vf_clamp(vf_load(gates + 2 * LANES), GATE_BOUND));
-    vf new = vf_exp_within(2.0f * vf_clamp(vf_load(gates + 3 * LANES), 10.0f));
+    vf i = 1.0f + vf_exp2_coarse(vf_clamp(vf_load(gates), GATE_BOUND));
+    vf f = 1.0f + vf_exp2_coarse(vf_clamp(vf_load(gates + LANES), GATE_BOUND));
+    vf o = 1.0f + vf_exp2_coarse(vf_clamp(vf_load(gates + 2 * LANES), GATE_BOUND));
+    vf new = vf_exp2_coarse(vf_clamp(vf_load(gates + 3 * LANES), GATE_BOUND));
     vf below = i * (new + 1.0f);
     vf c = (vf_load(cell) * below + (new - 1.0f) * f) / (f * below);
     vf_store(cell, c);
-    vf e = vf_exp_within(2.0f * vf_clamp(c, 10.0f));
-    vf_store(next, (e - 1.0f) / (o * (e + 1.0f)));
+    vf e = vf_exp2_coarse(vf_clamp(c * (2.0f * LOG2_E), GATE_BOUND));
+    return (e - 1.0f) / (o * (e + 1.0f));
 }
 
 /* One LSTM step of `rows` rows from `hidden` to `next`; gates[row] is where its own begin.
@@ -109,127 +125,150 @@ INLINE void close_cell(const float *gates, float *cell, float *next) {
  * Panel by panel: its product for all rows, then its cells, which are still in the first cache.
  */
 static void step_cells(const Decoder *decoder, long rows, const float *const *gates,
-                       const float *hidden, float *next, float *cell, long stride) {
-    const long depth = decoder->units + 2;
+                       const float velocity[2][BLOCK_ROWS], const int16_t *hidden, int16_t *next,
+                       float *cell) {
+    const long units = decoder->units;
     float made[BLOCK_ROWS * PANEL_COLUMNS] __attribute__((aligned(64)));
-    for (long unit = 0; unit < decoder->units; unit += LANES) {
-        const float *panel = decoder->recurrent + unit * PANEL_VECTORS * depth;
+    for (long unit = 0; unit < units; unit += LANES) {
+        const long column = unit * PANEL_VECTORS;
+        const int16_t *panel = decoder->recurrent + column * units;
+        const float *scale = decoder->recurrent_scale + column;
+        const float *by_x = decoder->recurrent_velocity + 2 * column, *by_y = by_x + PANEL_COLUMNS;
         for (long first = 0; first < rows; first += TILE_ROWS) {
-            vf sums[TILE_ROWS * PANEL_VECTORS];
-            for (int i = 0; i < TILE_ROWS * PANEL_VECTORS; i++)
-                sums[i] = vf_load(gates[first + i / PANEL_VECTORS] + unit * PANEL_VECTORS +
-                                  i % PANEL_VECTORS * LANES);
-            gemm_tile(TILE_ROWS, PANEL_VECTORS, panel, depth, hidden + first * stride, stride, sums);
-            memcpy(made + first * PANEL_COLUMNS, sums, sizeof sums);
+            vi sums[TILE_ROWS * PANEL_VECTORS] = {{0}};
+            fixed_tile(TILE_ROWS, PANEL_VECTORS, panel, units / 2, hidden + first * units, units,
+                       sums);
+#pragma GCC unroll 24
+            for (int i = 0; i < TILE_ROWS * PANEL_VECTORS; i++) {
+                const long row = first + i / PANEL_VECTORS;
+                const int at = i % PANEL_VECTORS * LANES;
+                vf gate = vf_load(gates[row] + column + at) + velocity[0][row] * vf_load(by_x + at) +
+                          velocity[1][row] * vf_load(by_y + at);
+                vf_store(made + first * PANEL_COLUMNS + i * LANES,
+                         gate + vf_of(sums[i]) * vf_load(scale + at));
+            }
         }
         for (long row = 0; row < rows; row++)
-            close_cell(made + row * PANEL_COLUMNS, cell + row * stride + unit,
-                       next + row * stride + unit);
+            store_fixed(next + row * units + unit,
+                        close_cell(made + row * PANEL_COLUMNS, cell + row * units + unit));
     }
 }
 
 static long whole_tiles(long rows) { return (rows + LOGIT_ROWS - 1) / LOGIT_ROWS * LOGIT_ROWS; }
 
-/* Gates and first states of one agent under one latent value, before any step. */
-static void begin(const Decoder *decoder, const Rollouts *all, int64_t agent, int64_t latent,
-                  Block *block, long at) {
-    const long size = decoder->size;
-    float *gates = block->gates + at * 4 * decoder->units;
-    float *hidden = block->hidden + at * block->stride;
-    float *cell = block->start_cell + at * block->stride;
-    memset(gates, 0, (size_t)(4 * decoder->units) * sizeof(float));
-    memset(hidden, 0, (size_t)block->stride * sizeof(float));
-    memset(cell, 0, (size_t)block->stride * sizeof(float));
+/* What all rows of an agent begin with, in the order of panels. */
+static void read_agent(const Decoder *decoder, const Rollouts *all, int64_t agent, Block *block) {
+    const long size = decoder->size, units = decoder->units;
+    memset(block->own_gates, 0, (size_t)(6 * units) * sizeof(float)); /* own_start is behind */
     for (int gate = 0; gate < 4; gate++) {
-        const float *own = all->gates + (agent * 4 + gate) * size;
-        const float *shared = decoder->gates_latent + (latent * 4 + gate) * size;
+        const float *from = all->gates + (agent * 4 + gate) * size;
         for (long unit = 0; unit < size; unit++)
-            gates[(unit / LANES * 4 + gate) * LANES + unit % LANES] = own[unit] + shared[unit];
+            block->own_gates[(unit / LANES * 4 + gate) * LANES + unit % LANES] =
+                GATE_SCALE[gate] * from[unit];
     }
-    const float *own = all->state + agent * 2 * size;
-    const float *shared = decoder->start_latent + latent * 2 * size;
-    for (long unit = 0; unit < size; unit++) {
-        hidden[unit] = own[unit] + shared[unit];
-        cell[unit] = own[size + unit] + shared[size + unit];
+    for (int half = 0; half < 2; half++)
+        memcpy(block->own_start + half * units, all->state + (agent * 2 + half) * size,
+               (size_t)size * sizeof(float));
+}
+
+/* Gates, first states and velocity of an agent that was read, under one latent value. */
+static void begin(const Decoder *decoder, const float *velocity, int64_t latent, Block *block,
+                  long at) {
+    const long units = decoder->units;
+    const float *gates = decoder->gates_latent + latent * 4 * units;
+    const float *start = decoder->start_latent + latent * 2 * units;
+    vf fault = {0};
+    for (long i = 0; i < 4 * units; i += LANES) {
+        vf gate = vf_load(block->own_gates + i) + vf_load(gates + i);
+        vf_store(block->gates + at * 4 * units + i, gate);
+        fault += gate * 0.0f;
     }
-    for (long unit = 0; unit < decoder->units; unit += LANES)
-        vf_store(hidden + unit, vf_tanh(vf_load(hidden + unit)));
-    memcpy(hidden + decoder->units, all->velocity + agent * 2, 2 * sizeof(float));
+    for (long unit = 0; unit < units; unit += LANES) {
+        vf hidden = vf_load(block->own_start + unit) + vf_load(start + unit);
+        vf cell = vf_load(block->own_start + units + unit) + vf_load(start + units + unit);
+        store_fixed(block->hidden + at * units + unit, vf_tanh(hidden));
+        vf_store(block->start_cell + at * units + unit, cell);
+        fault += (hidden + cell) * 0.0f;
+    }
+    /* An integer cannot be NaN: what is not finite shows in the velocities instead. */
+    for (int axis = 0; axis < 2; axis++)
+        block->start_velocity[axis][at] = velocity[axis] + vf_sum(fault);
 }
 
 /* Makes a block of the rows at [first, first + rows) of the order: their first LSTM step is made
- * once for each start. Rows of padding repeat the last one. */
+ * once for each start. Rows of padding repeat others. */
 static void begin_block(const Decoder *decoder, const Rollouts *all, long first, long rows,
                         Block *block) {
-    const long stride = block->stride;
+    const long units = block->units;
     const float *gates_of[BLOCK_ROWS];
     long starts = 0;
     int64_t agent = -1, latent = -1;
     for (long i = 0; i < rows; i++) {
         const int64_t row = all->order[first + i];
-        if (all->agent[row] != agent || all->latent[row] != latent) {
-            agent = all->agent[row], latent = all->latent[row];
-            begin(decoder, all, agent, latent, block, starts++);
-        }
+        const bool another = all->agent[row] != agent;
+        if (another) read_agent(decoder, all, agent = all->agent[row], block);
+        if (another || all->latent[row] != latent)
+            begin(decoder, all->velocity + agent * 2, latent = all->latent[row], block, starts++);
         block->row[i] = row;
         block->start_index[i] = starts - 1;
     }
     const long padded = whole_tiles(starts);
     for (long at = 0; at < padded; at++) {
-        gates_of[at] = block->gates + (at < starts ? at : starts - 1) * 4 * decoder->units;
+        gates_of[at] = block->gates + (at < starts ? at : starts - 1) * 4 * units;
         if (at < starts) continue;
-        memcpy(block->hidden + at * stride, block->hidden, (size_t)stride * sizeof(float));
-        memcpy(block->start_cell + at * stride, block->start_cell, (size_t)stride * sizeof(float));
+        memcpy(block->hidden + at * units, block->hidden, (size_t)units * sizeof(int16_t));
+        memcpy(block->start_cell + at * units, block->start_cell, (size_t)units * sizeof(float));
+        for (int axis = 0; axis < 2; axis++)
+            block->start_velocity[axis][at] = block->start_velocity[axis][0];
     }
-    step_cells(decoder, padded, gates_of, block->hidden, block->start_hidden, block->start_cell,
-               stride);
+    step_cells(decoder, padded, gates_of, block->start_velocity, block->hidden,
+               block->start_hidden, block->start_cell);
     const long filled = whole_tiles(rows);
     for (long i = 0; i < filled; i++) {
         const int64_t start = block->start_index[i < rows ? i : rows - 1];
-        const float *velocity = all->velocity + all->agent[block->row[i < rows ? i : rows - 1]] * 2;
-        block->start_of[i] = block->gates + start * 4 * decoder->units;
-        memcpy(block->hidden + i * stride, block->start_hidden + start * stride,
-               (size_t)decoder->units * sizeof(float));
-        memcpy(block->cell + i * stride, block->start_cell + start * stride,
-               (size_t)decoder->units * sizeof(float));
-        block->velocity[0][i] = velocity[0];
-        block->velocity[1][i] = velocity[1];
+        block->start_of[i] = block->gates + start * 4 * units;
+        memcpy(block->hidden + i * units, block->start_hidden + start * units,
+               (size_t)units * sizeof(int16_t));
+        memcpy(block->cell + i * units, block->start_cell + start * units,
+               (size_t)units * sizeof(float));
+        for (int axis = 0; axis < 2; axis++)
+            block->velocity[axis][i] = block->start_velocity[axis][start];
     }
     for (long i = filled; i < BLOCK_ROWS; i++) block->velocity[0][i] = block->velocity[1][i] = 0.0f;
 }
 
-/* The next step: velocities beside hidden states, then the cells. */
+/* The next step of all rows. */
 static void advance(const Decoder *decoder, long filled, Block *block) {
-    for (long i = 0; i < filled; i++) {
-        float *y = block->hidden + i * block->stride + decoder->units;
-        y[0] = block->velocity[0][i];
-        y[1] = block->velocity[1][i];
-    }
-    step_cells(decoder, filled, block->start_of, block->hidden, block->next, block->cell,
-               block->stride);
-    float *last = block->hidden;
+    step_cells(decoder, filled, block->start_of, block->velocity, block->hidden, block->next,
+               block->cell);
+    int16_t *last = block->hidden;
     block->hidden = block->next;
     block->next = last;
 }
 
-/* Weight logits of the components: raw[row][logits]. */
-static void weigh(const Decoder *decoder, long filled, Block *block) {
-    const long columns = LOGIT_VECTORS * LANES;
-    for (long column = 0; column < decoder->logits; column += columns) {
-        const float *panel = decoder->logit_weight + column * decoder->units;
-        for (long first = 0; first < filled; first += LOGIT_ROWS) {
-            vf sums[LOGIT_ROWS * LOGIT_VECTORS];
-#pragma GCC unroll 24
-            for (int i = 0; i < LOGIT_ROWS * LOGIT_VECTORS; i++)
-                sums[i] = vf_load(decoder->logit_bias + column + i % LOGIT_VECTORS * LANES);
-            gemm_tile(LOGIT_ROWS, LOGIT_VECTORS, panel, decoder->units,
-                      block->hidden + first * block->stride, block->stride, sums);
-            for (int i = 0; i < LOGIT_ROWS * LOGIT_VECTORS; i++)
-                vf_store(block->raw + (first + i / LOGIT_VECTORS) * decoder->logits + column +
-                             i % LOGIT_VECTORS * LANES,
-                         sums[i]);
+/* Linear outputs of the hidden states: raw[row][columns], panel by panel of `vectors` vectors. */
+INLINE void read_hidden(const int rows, const int vectors, const int16_t *weight,
+                        const float *scale, const float *bias, long columns, long filled,
+                        Block *block) {
+    const long units = block->units;
+    for (long column = 0; column < columns; column += vectors * LANES) {
+        const int16_t *panel = weight + column * units;
+        for (long first = 0; first < filled; first += rows) {
+            vi sums[TILE_ROWS * PANEL_VECTORS] = {{0}};
+            fixed_tile(rows, vectors, panel, units / 2, block->hidden + first * units, units, sums);
+            for (int i = 0; i < rows * vectors; i++) {
+                const long at = column + i % vectors * LANES;
+                vf_store(block->raw + (first + i / vectors) * columns + at,
+                         vf_of(sums[i]) * vf_load(scale + at) + vf_load(bias + at));
+            }
         }
     }
+}
+
+/* Weight logits of the components: raw[row][logits]. */
+static void weigh(const Decoder *decoder, long filled, Block *block) {
+    read_hidden(LOGIT_ROWS, LOGIT_VECTORS, decoder->logit_weight, decoder->logit_scale,
+                decoder->logit_bias, decoder->logits, filled, block);
 }
 
 /* The component of each of LANES rows at which the cumulated weights pass its uniform number. */
@@ -254,19 +293,24 @@ static void choose(const Decoder *decoder, const float *raw, const float *unifor
 
 /* The five numbers of a row's component: mean change x, y, log scale x, y, correlation. */
 static void read_component(const Decoder *decoder, long row, int32_t index, Block *block) {
-    const float *hidden = block->hidden + row * block->stride;
-    const float *weight = decoder->chosen_weight + index * 5 * decoder->units;
-    vf sums[5] = {{0}};
-    for (long unit = 0; unit < decoder->units; unit += LANES) {
-        vf h = vf_load(hidden + unit);
+    const long units = block->units;
+    const int16_t *hidden = block->hidden + row * units;
+    const int16_t *weight = decoder->chosen_weight + index * 5 * units;
+    vi sums[5] = {{0}};
+    for (long unit = 0; unit < units; unit += 2 * LANES) {
+        vi h, w;
+        memcpy(&h, hidden + unit, sizeof h);
 #pragma GCC unroll 5
-        for (int number = 0; number < 5; number++)
-            sums[number] += h * vf_load(weight + number * decoder->units + unit);
+        for (int number = 0; number < 5; number++) {
+            memcpy(&w, weight + number * units + unit, sizeof w);
+            sums[number] += vi_dot_pairs(h, w);
+        }
     }
 #pragma GCC unroll 5
     for (int number = 0; number < 5; number++)
         block->chosen[number][row] =
-            vf_sum(sums[number]) + decoder->chosen_bias[index * 5 + number];
+            (float)vi_sum(sums[number]) * decoder->chosen_scale[index * 5 + number] +
+            decoder->chosen_bias[index * 5 + number];
 }
 
 INLINE vf scale_of(const Decoder *decoder, vf raw) {
@@ -336,20 +380,8 @@ KERNEL void trajectron_decode_sample(const Decoder *decoder, const Rollouts *all
 
 /* All outputs of the head: raw[row][outputs]. */
 static void read_mixture(const Decoder *decoder, long filled, Block *block) {
-    for (long column = 0; column < decoder->outputs; column += PANEL_COLUMNS) {
-        const float *panel = decoder->head_weight + column * decoder->units;
-        for (long first = 0; first < filled; first += TILE_ROWS) {
-            vf sums[TILE_ROWS * 4];
-#pragma GCC unroll 24
-            for (int i = 0; i < TILE_ROWS * 4; i++)
-                sums[i] = vf_load(decoder->head_bias + column + i % 4 * LANES);
-            gemm_tile(TILE_ROWS, 4, panel, decoder->units, block->hidden + first * block->stride,
-                      block->stride, sums);
-            for (int i = 0; i < TILE_ROWS * 4; i++)
-                vf_store(block->raw + (first + i / 4) * decoder->outputs + column + i % 4 * LANES,
-                         sums[i]);
-        }
-    }
+    read_hidden(TILE_ROWS, PANEL_VECTORS, decoder->head_weight, decoder->head_scale,
+                decoder->head_bias, decoder->outputs, filled, block);
 }
 
 /* The mixture of one row merged to one Gaussian: mean change [2], covariance [3].

@@ -6,6 +6,7 @@ Shape letters as in ``shapes``.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,20 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from trajectron_model.kernels.fixed_point import FixedRows, fixed_rows
 from trajectron_model.kernels.loading import Kernels
-from trajectron_model.kernels.packing import (
-    PANEL_VECTORS,
-    PackedWeights,
-    library_for,
-    padded,
-    panels,
-)
+from trajectron_model.kernels.packing import PANEL_VECTORS, PackedWeights, library_for
 from trajectron_model.kernels.threads import share
 
 if TYPE_CHECKING:
     from trajectron_model.decoder import Decoder, Prepared
 
-_LOGIT_VECTORS = 2  # as in decode.c
+# As in decode.c: how many vectors of logits are made at once, and gates as powers of two.
+_LOGIT_VECTORS = 2
+_GATE_SCALE = (-1.0 / math.log(2.0),) * 3 + (2.0 / math.log(2.0),)
 # Fewer rows are not worth waking a thread for.
 _LEAST_ROWS = 24
 # A logit so low that a component that only fills a vector has no weight.
@@ -38,15 +36,12 @@ class _DecoderStruct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("size", "units", "components", "padded")),
         *((name, ctypes.c_int64) for name in ("logits", "outputs")),
-        ("recurrent", ctypes.c_void_p),
+        *((f"recurrent{part}", ctypes.c_void_p) for part in ("", "_scale", "_velocity")),
         ("gates_latent", ctypes.c_void_p),
         ("start_latent", ctypes.c_void_p),
-        ("logit_weight", ctypes.c_void_p),
-        ("logit_bias", ctypes.c_void_p),
-        ("chosen_weight", ctypes.c_void_p),
-        ("chosen_bias", ctypes.c_void_p),
-        ("head_weight", ctypes.c_void_p),
-        ("head_bias", ctypes.c_void_p),
+        *((f"logit_{part}", ctypes.c_void_p) for part in ("weight", "scale", "bias")),
+        *((f"chosen_{part}", ctypes.c_void_p) for part in ("weight", "scale", "bias")),
+        *((f"head_{part}", ctypes.c_void_p) for part in ("weight", "scale", "bias")),
         ("log_sigma_min", ctypes.c_float),
         ("log_sigma_span", ctypes.c_float),
     )
@@ -188,29 +183,26 @@ def _weights(decoder: Decoder) -> tuple[Tensor, ...]:
 def _pack(decoder: Decoder, library: Kernels) -> _Packed:
     lanes = library.lanes
     size, components = decoder.size, decoder.components
-    units, many = _up(size, lanes), _up(components, lanes)
+    units, many = _up(size, 2 * lanes), _up(components, lanes)
     logits = _up(components, _LOGIT_VECTORS * lanes)
     weight, bias = decoder.head.weight.detach(), decoder.head.bias.detach()
-    kinds, kind_bias = _by_kind(weight, bias, units, many)
-    numbers = weight[components:].reshape(components, 5, size)
-    chosen = weight.new_zeros(components, 5, units)
-    chosen[..., :size] = numbers
-    logit_bias = bias.new_full((logits,), _NO_WEIGHT)
-    logit_bias[:components] = bias[:components]
-    head = panels(kinds, lanes)
+    chosen = fixed_rows(_wide(weight[components:], units))
+    head, head_bias = _by_kind(weight, bias, units, _up(6 * many, PANEL_VECTORS * lanes), many)
+    recurrent, velocity = _recurrent(decoder, units, lanes)
     tensors = (
-        _recurrent(decoder, units, lanes),
-        decoder.gates_latent.weight.detach().contiguous(),
-        decoder.start_latent.weight.detach().contiguous(),
-        _logit_panels(weight[:components], units, logits, lanes),
-        logit_bias,
-        chosen,
+        *_panels(fixed_rows(recurrent), PANEL_VECTORS, lanes),
+        velocity,
+        _gates_by_panel(decoder.gates_latent.weight.detach(), size, units, lanes),
+        _wide(decoder.start_latent.weight.detach().reshape(-1, size), units),
+        *_panels(fixed_rows(_tall(_wide(weight[:components], units), logits)), _LOGIT_VECTORS, lanes),
+        _tall(bias[:components], logits, _NO_WEIGHT),
+        *chosen,
         bias[components:].contiguous(),
-        head,
-        padded(kind_bias, lanes),
+        *_panels(fixed_rows(head), PANEL_VECTORS, lanes),
+        head_bias,
     )
     struct = _DecoderStruct(
-        *(size, units, components, many, logits, head.shape[0] * head.shape[2]),
+        *(size, units, components, many, logits, len(head)),
         *(tensor.data_ptr() for tensor in tensors),
         decoder.log_sigma_min,
         decoder.log_sigma_max - decoder.log_sigma_min,
@@ -220,26 +212,33 @@ def _pack(decoder: Decoder, library: Kernels) -> _Packed:
     return _Packed(struct, tensors, needed(ctypes.byref(struct)))
 
 
-def _recurrent(decoder: Decoder, units: int, lanes: int) -> Tensor:
-    """[y; h] -> gates as [units / lanes, units + 2, 4 lanes]: inputs in the order h, y."""
-    given = decoder.recurrent.weight.detach()  # [4 size, 2 + size]
-    gates = given.new_zeros(PANEL_VECTORS, units, units + 2)
-    own = given.reshape(PANEL_VECTORS, decoder.size, -1)
-    gates[:, : decoder.size, : decoder.size] = own[..., 2:]
-    gates[:, : decoder.size, units:] = own[..., :2]
-    by_panel = gates.reshape(PANEL_VECTORS, -1, lanes, units + 2)
-    return by_panel.permute(1, 3, 0, 2).contiguous()
+def _recurrent(decoder: Decoder, units: int, lanes: int) -> tuple[Tensor, Tensor]:
+    """h -> gates [4 units, units] and y -> gates [units / lanes, 2, 4, lanes].
+
+    Rows go by panels: ``lanes`` hidden units of each gate beside each other; gates are powers
+    of two.
+    """
+    given = decoder.recurrent.weight.detach().reshape(PANEL_VECTORS, decoder.size, -1)
+    given = given * given.new_tensor(_GATE_SCALE)[:, None, None]
+    gates = given.new_zeros(PANEL_VECTORS, units, 2 + units)
+    gates[:, : decoder.size, : 2 + decoder.size] = given
+    by_panel = gates.reshape(PANEL_VECTORS, -1, lanes, 2 + units).transpose(0, 1)
+    velocity = by_panel[..., :2].permute(0, 3, 1, 2).contiguous()
+    return by_panel[..., 2:].reshape(-1, units), velocity
 
 
-def _logit_panels(weight: Tensor, units: int, logits: int, lanes: int) -> Tensor:
-    """Weights of logits [M, size] as [logits / (2 lanes), units, 2 lanes]."""
-    full = weight.new_zeros(logits, units)
-    full[: weight.shape[0], : weight.shape[1]] = weight
-    return full.reshape(-1, _LOGIT_VECTORS * lanes, units).transpose(1, 2).contiguous()
+def _gates_by_panel(gates: Tensor, size: int, units: int, lanes: int) -> Tensor:
+    """Gates [Z, 4 size] as powers of two, [Z, units / lanes, 4, lanes]."""
+    wide = gates.new_zeros(len(gates), PANEL_VECTORS, units)
+    wide[..., :size] = gates.reshape(len(gates), PANEL_VECTORS, size)
+    wide = wide * wide.new_tensor(_GATE_SCALE)[:, None]
+    return wide.reshape(len(gates), PANEL_VECTORS, -1, lanes).transpose(1, 2).contiguous()
 
 
-def _by_kind(weight: Tensor, bias: Tensor, units: int, many: int) -> tuple[Tensor, Tensor]:
-    """The head's rows as six kinds of ``many`` each: [6 many, units] and [6 many]."""
+def _by_kind(
+    weight: Tensor, bias: Tensor, units: int, outputs: int, many: int
+) -> tuple[Tensor, Tensor]:
+    """The head's rows as six kinds of ``many`` each: [outputs, units] and [outputs]."""
     components = weight.shape[0] // 6
     kinds, kind_bias = weight.new_zeros(6, many, units), bias.new_zeros(6, many)
     kinds[0, :components, : weight.shape[1]] = weight[:components]
@@ -248,7 +247,28 @@ def _by_kind(weight: Tensor, bias: Tensor, units: int, many: int) -> tuple[Tenso
     rest = weight[components:].reshape(components, 5, -1)
     kinds[1:, :components, : weight.shape[1]] = rest.transpose(0, 1)
     kind_bias[1:, :components] = bias[components:].reshape(components, 5).T
-    return kinds.reshape(6 * many, units), kind_bias.reshape(6 * many)
+    return _tall(kinds.flatten(0, 1), outputs), _tall(kind_bias.flatten(), outputs)
+
+
+def _panels(rows: FixedRows, vectors: int, lanes: int) -> tuple[Tensor, Tensor]:
+    """Integers [M, D] as [M / (vectors lanes), D / 2, vectors, lanes, 2], and their scales."""
+    depth = rows.integers.shape[1]
+    by_panel = rows.integers.reshape(-1, vectors, lanes, depth // 2, 2)
+    return by_panel.permute(0, 3, 1, 2, 4).contiguous(), rows.scale
+
+
+def _wide(weight: Tensor, depth: int) -> Tensor:
+    """Weights [M, size] for so many hidden units, zeros at the end."""
+    wider = weight.new_zeros(len(weight), depth)
+    wider[:, : weight.shape[1]] = weight
+    return wider
+
+
+def _tall(rows: Tensor, length: int, fill: float = 0.0) -> Tensor:
+    """So many rows, filled up at the end."""
+    longer = rows.new_full((length, *rows.shape[1:]), fill)
+    longer[: len(rows)] = rows
+    return longer
 
 
 def _up(number: int, step: int) -> int:

@@ -11,11 +11,11 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(__AVX512F__)
+#if defined(__AVX512BW__)
 #include <immintrin.h>
 #define LANES 16
 #define TILE_ROWS 6 /* 6 x 4 sums, 4 weights and 1 input in 32 registers */
-#elif defined(__AVX__)
+#elif defined(__AVX2__)
 #include <immintrin.h>
 #define LANES 8
 #define TILE_ROWS 3 /* 3 x 4 sums, 3 inputs and 1 weight in 16 registers */
@@ -38,6 +38,7 @@
 
 typedef float vf __attribute__((vector_size(LANES * 4)));
 typedef int32_t vi __attribute__((vector_size(LANES * 4)));
+typedef int16_t vs __attribute__((vector_size(LANES * 2)));
 
 INLINE vf vf_load(const float *from) {
     vf v;
@@ -52,9 +53,9 @@ INLINE vf vf_all(float x) { return x - (vf){0}; }
 
 /* The smaller and the larger; NaN if x is NaN. */
 INLINE vf vf_min(vf bound, vf x) {
-#if defined(__AVX512F__)
+#if defined(__AVX512BW__)
     return (vf)_mm512_min_ps((__m512)bound, (__m512)x);
-#elif defined(__AVX__)
+#elif defined(__AVX2__)
     return (vf)_mm256_min_ps((__m256)bound, (__m256)x);
 #elif defined(__aarch64__)
     return (vf)vminq_f32((float32x4_t)bound, (float32x4_t)x);
@@ -64,9 +65,9 @@ INLINE vf vf_min(vf bound, vf x) {
 }
 
 INLINE vf vf_max(vf bound, vf x) {
-#if defined(__AVX512F__)
+#if defined(__AVX512BW__)
     return (vf)_mm512_max_ps((__m512)bound, (__m512)x);
-#elif defined(__AVX__)
+#elif defined(__AVX2__)
     return (vf)_mm256_max_ps((__m256)bound, (__m256)x);
 #elif defined(__aarch64__)
     return (vf)vmaxq_f32((float32x4_t)bound, (float32x4_t)x);
@@ -89,6 +90,14 @@ INLINE float vf_sum(vf x) {
         for (int lane = 0; lane < width; lane++) lanes[lane] += lanes[lane + width];
     return lanes[0];
 }
+
+INLINE int32_t vi_sum(vi x) {
+    int32_t sum = 0;
+    for (int lane = 0; lane < LANES; lane++) sum += x[lane];
+    return sum;
+}
+
+INLINE vf vf_of(vi x) { return __builtin_convertvector(x, vf); }
 
 INLINE float vf_largest(vf x) {
     float largest = x[0];
@@ -116,6 +125,22 @@ INLINE vf vf_exp_within(vf x) {
     e = e * r + 1.0f;
     e = e * r + 1.0f;
     return e * (vf)(((vi)shifted << 23) + 0x3f800000);
+}
+
+/* 2^x to 3e-6 of itself, for x in [-126, 126]: enough where x itself comes of 16-bit products.
+ *
+ * As vf_exp_within, by a polynomial of degree 4 that is nowhere in [-1/2, 1/2] further off.
+ */
+INLINE vf vf_exp2_coarse(vf x) {
+    const float round_by = 12582912.0f;
+    vf shifted = x + round_by;
+    vf r = x - (shifted - round_by);
+    vf e = vf_all(0.0095701f);
+    e = e * r + 0.05591786f;
+    e = e * r + 0.24024745f;
+    e = e * r + 0.69312181f;
+    e = e * r + 0.99999926f;
+    return (vf)((vi)e + ((vi)shifted << 23));
 }
 
 INLINE vf vf_clamp(vf x, float bound) { return vf_min(vf_all(bound), vf_max(vf_all(-bound), x)); }
@@ -146,7 +171,64 @@ INLINE vf vf_log(vf x) {
     p = p * s2 + 2.0f / 5.0f;
     p = p * s2 + 2.0f / 3.0f;
     p = p * s2 * s + 2.0f * s;
-    return p + __builtin_convertvector(n, vf) * 0.693147181f;
+    return p + vf_of(n) * 0.693147181f;
+}
+
+/* Fixed point: x in [-1, 1] as a 16-bit integer, to the nearest 2^-FRACTION_BITS. As
+ * fixed_point.py has it. */
+#define FRACTION_BITS 13
+
+INLINE void store_fixed(int16_t *to, vf x) {
+    const float round_by = 12582912.0f; /* 1.5 x 2^23: the bits of the sum end in the integer */
+    vi bits = (vi)(x * (float)(1 << FRACTION_BITS) + round_by) - (vi)vf_all(round_by);
+    vs fixed = __builtin_convertvector(bits, vs);
+    memcpy(to, &fixed, sizeof fixed);
+}
+
+/* a and b as 16-bit integers: a[2i] b[2i] + a[2i + 1] b[2i + 1] in lane i. */
+INLINE vi vi_dot_pairs(vi a, vi b) {
+#if defined(__AVX512BW__)
+    return (vi)_mm512_madd_epi16((__m512i)a, (__m512i)b);
+#elif defined(__AVX2__)
+    return (vi)_mm256_madd_epi16((__m256i)a, (__m256i)b);
+#elif defined(__aarch64__)
+    int16x8_t left = (int16x8_t)a, right = (int16x8_t)b;
+    int32x4_t low = vmull_s16(vget_low_s16(left), vget_low_s16(right));
+    return (vi)vpaddq_s32(low, vmull_high_s16(left, right));
+#else
+    return (vi)_mm_madd_epi16((__m128i)a, (__m128i)b);
+#endif
+}
+
+/* sums[row][vector] += inputs[row][k] * panel[k][vector], in integers: exact, as long as no sum
+ * leaves 32 bits (fixed_point.py sees to that).
+ *
+ * panel: [pairs][vectors][LANES][2] packed weights, two neighbours in k beside each other;
+ * inputs: rows `stride` integers apart; sums: [rows][vectors]. Otherwise as gemm_tile: twice as
+ * many products an instruction.
+ */
+INLINE void fixed_tile(const int rows, const int vectors, const int16_t *panel, long pairs,
+                       const int16_t *inputs, long stride, vi *sums) {
+    vi held[4 * TILE_ROWS];
+#pragma GCC unroll 24
+    for (int i = 0; i < rows * vectors; i++) held[i] = sums[i];
+    for (long k = 0; k < pairs; k++) {
+        vi weights[PANEL_VECTORS];
+#pragma GCC unroll 4
+        for (int v = 0; v < vectors; v++)
+            memcpy(weights + v, panel + (k * vectors + v) * LANES * 2, sizeof(vi));
+#pragma GCC unroll 12
+        for (int row = 0; row < rows; row++) {
+            int32_t pair;
+            memcpy(&pair, inputs + row * stride + 2 * k, sizeof pair);
+            vi input = pair - (vi){0};
+#pragma GCC unroll 4
+            for (int v = 0; v < vectors; v++)
+                held[row * vectors + v] += vi_dot_pairs(input, weights[v]);
+        }
+    }
+#pragma GCC unroll 24
+    for (int i = 0; i < rows * vectors; i++) sums[i] = held[i];
 }
 
 /* sums[row][vector] += inputs[row][k] * panel[k][vector], k in order.
