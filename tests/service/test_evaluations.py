@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import signal
@@ -18,6 +19,7 @@ from tests.contract.recordings import walkers
 from tests.contract.servers import save_small_model
 
 from trajectron_model import registry
+from trajectron_service import tenancy
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.evaluations import queue, worker
 from trajectron_service.evaluations.background import Background, told
@@ -173,6 +175,45 @@ async def test_without_a_folder_nothing_outlives_the_service(
     assert not folder.exists()
     async with opened(alone) as evaluations:
         assert await evaluations.list_page(None, "") == ((), "")
+
+
+async def test_pages_tell_nothing_of_other_tenants(
+    settings: Settings, carried: Callable[[Run], None]
+) -> None:
+    carried(forever)
+
+    async def pages_of_ann(evaluations: Evaluations) -> tuple[list[str], list[str]]:
+        tenancy.enter("ann")
+        ids: list[str] = []
+        tokens: list[str] = []
+        token = ""
+        while True:
+            page, token = await evaluations.list_page(1, token)
+            ids += [info.id for info in page]
+            if not token:
+                return ids, tokens
+            tokens.append(base64.urlsafe_b64decode(token).decode())
+
+    async def made(evaluations: Evaluations, tenant: str, name: str) -> EvaluationInfo:
+        tenancy.enter(tenant)
+        return await create(evaluations, name)
+
+    async with opened(settings) as evaluations:
+        at = {}
+        for tenant, name in [("bob", "x"), ("ann", "1"), ("bob", "y"), ("ann", "2"), ("ann", "3")]:
+            info = await asyncio.create_task(made(evaluations, tenant, name))
+            at[name] = info.created_at
+        ids, tokens = await asyncio.create_task(pages_of_ann(evaluations))
+        assert ids == ["3", "2", "1"]
+        assert tokens == [f"{at['3']!r} 3", f"{at['2']!r} 2"]  # what ann has seen, and no count
+
+
+@pytest.mark.parametrize("place", ["2", "2 ", "nan a", "inf a", "x a", ""])
+async def test_page_tokens_of_nobodys_are_refused(settings: Settings, place: str) -> None:
+    token = base64.urlsafe_b64encode(place.encode()).decode() or "="
+    async with opened(settings) as evaluations:
+        with pytest.raises(ServiceError, match="page_token"):
+            await evaluations.list_page(1, token)
 
 
 async def test_two_services_do_not_share_a_folder(settings: Settings) -> None:
@@ -675,3 +716,5 @@ def test_the_last_words_of_a_process_are_its_reason(tmp_path: Path) -> None:
     assert folder.last_words() == ""
     folder.log.write_text("Traceback\n  line 3\nMemoryError: no more\n\n")
     assert folder.last_words() == "MemoryError: no more"
+    folder.log.write_text(f"OSError: no space for '{folder.work}/b'\n")
+    assert folder.last_words() == "OSError: no space for 'work/b'"

@@ -104,13 +104,16 @@ class EvaluationFolder:
         return EvaluationResult((self.run / name).read_bytes(), content_type)
 
     def last_words(self) -> str:
-        """The last line that the worker said, shortened; empty where it said nothing."""
+        """The last line that the worker said, shortened; empty where it said nothing.
+
+        Not where the folder is: its name counts the evaluations of all tenants.
+        """
         try:
             text = self.log.read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError:
             return ""
         lines = [line.strip() for line in text.splitlines() if line.strip()]
-        return lines[-1][:_LONGEST_LINE] if lines else ""
+        return lines[-1].replace(f"{self.path}/", "")[:_LONGEST_LINE] if lines else ""
 
 
 def _write(file: Path, content: bytes) -> None:

@@ -202,13 +202,12 @@ class Evaluations:
         """Evaluations, the newest first, and the token of the next page, empty on the last."""
         with self._work.taken():
             size = pages.size(page_size)
-            before = _read_place(page_token)
-            older = [job for job in self._own() if job.stored.number < before]
-            older.sort(key=lambda job: -job.stored.number)
+            after = _read_place(page_token)
+            infos = sorted((job.info for job in self._own()), key=_place)
+            older = [info for info in infos if after is None or _place(info) > after]
             page = older[:size]
-            more = len(older) > size
-            token = pages.write_token(str(page[-1].stored.number)) if more else ""
-            return tuple(job.info for job in page), token
+            token = _write_place(_place(page[-1])) if len(older) > size else ""
+            return tuple(page), token
 
     async def watch(self, identity: str) -> AsyncGenerator[EvaluationInfo, None]:
         """An evaluation as it is now, and again whenever it has changed, until it has ended.
@@ -284,7 +283,7 @@ class Evaluations:
         if waiting >= self._settings.evaluation_queue_size:
             raise ServiceError(
                 ErrorKind.OVERLOADED,
-                f"{waiting} evaluations wait already; try again later",
+                "as many evaluations wait as this server takes; try again later",
                 retry_after_s=_RETRY_AFTER_S,
             )
         if len(self._queue) + self._entering >= self._settings.max_evaluations:
@@ -295,14 +294,31 @@ class Evaluations:
             )
 
 
-def _read_place(page_token: str) -> float:
-    """The number that a page's evaluations are older than."""
+# Where an evaluation stands in its tenant's list, the newest first: of what the tenant sees anyway.
+# A number counted over all tenants would tell each how busy the others are.
+_Place = tuple[float, str]
+
+
+def _place(info: EvaluationInfo) -> _Place:
+    return -info.created_at, info.id
+
+
+def _write_place(place: _Place) -> str:
+    return pages.write_token(f"{-place[0]!r} {place[1]}")
+
+
+def _read_place(page_token: str) -> _Place | None:
+    """The place that a page begins after; None for the first page."""
     if not page_token:
-        return math.inf
+        return None
+    created_at, _, identity = pages.read_token(page_token).partition(" ")
     try:
-        return int(pages.read_token(page_token))
+        at = float(created_at)
     except ValueError:
         raise pages.foreign_token() from None
+    if not (math.isfinite(at) and identity):
+        raise pages.foreign_token()
+    return -at, identity
 
 
 def _unknown(identity: str) -> ServiceError:
