@@ -151,6 +151,7 @@ class Decoder(nn.Module):
         uniform: Tensor,
         normal: Tensor,
         limit: float,
+        horizons: Tensor | None = None,
     ) -> Tensor:
         """Sampled velocities [R, H, 2].
 
@@ -160,8 +161,12 @@ class Decoder(nn.Module):
             uniform: [R, H] chooses components.
             normal: [R, H, 2] standard normals.
             limit: on speed, in units of the speed scale; what is fed back is limited too.
+            horizons: [N] steps that are wanted of each agent, at most H, by default H: later
+                ones may be anything.
         """
-        done = decoding.sample(self, prepared, agent, latent, uniform, normal, limit)
+        if horizons is None:
+            horizons = torch.full_like(prepared.velocity[:, 0], uniform.shape[1]).long()
+        done = decoding.sample(self, prepared, agent, latent, uniform, normal, limit, horizons)
         if done is not None:
             return done
         sampled = torch.empty_like(normal)
@@ -187,19 +192,27 @@ class Decoder(nn.Module):
         return torch.stack(steps, dim=1)
 
     def moments(
-        self, prepared: Prepared, agent: Tensor, latent: Tensor, horizon: int, limit: float
+        self, prepared: Prepared, agent: Tensor, latent: Tensor, horizons: Tensor, limit: float
     ) -> tuple[Tensor, Tensor]:
         """Rollouts on the mixture's mean, of agent [R] under latent value [R] each.
 
         At each step the mixture is merged to one Gaussian and its mean, limited to ``limit``
         (in units of the speed scale), is fed back.
 
+        Args:
+            prepared: N agents.
+            agent, latent: [R] of each rollout.
+            horizons: [N] steps of each agent, H the most of them.
+            limit: on speed.
+
         Returns:
-            velocity means [R, H, 2] and the covariances of the changes of velocity [R, H, 3].
+            velocity means [R, H, 2] and the covariances of the changes of velocity [R, H, 3];
+            behind an agent's own steps they may be anything finite.
         """
-        done = decoding.moments(self, prepared, agent, latent, horizon, limit)
+        done = decoding.moments(self, prepared, agent, latent, horizons, limit)
         if done is not None:
             return done
+        horizon = int(horizons.max()) if horizons.numel() else 0
         means = prepared.velocity.new_empty(len(agent), horizon, 2)
         covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
         for rows in _blocks(len(agent)):

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -40,7 +41,8 @@ from trajectron_model.modes import (
 )
 from trajectron_model.node_model import NodeModel
 from trajectron_model.noise import SAMPLINGS, Sampling, scene_noise
-from trajectron_model.state import SceneState, stack
+from trajectron_model.rows import SceneRows, rows_of
+from trajectron_model.state import SceneState
 
 if TYPE_CHECKING:
     from trajectron_model.trajectron import Trajectron
@@ -61,9 +63,10 @@ class ForecastRequest:
         agents: ids wanted, in this order; None for all that can move.
         include_modes: whether means and covariances are given; ``gmm`` always gives them.
         sampling: how one agent's samples go together; see ``noise``.
+        horizons: steps of each of ``agents``, 1 to 60, instead of H for all.
 
     Raises:
-        ValueError: a number out of its bounds.
+        ValueError: a number out of its bounds; horizons without agents or not as many.
     """
 
     mode: Literal["full", "z_best", "gmm"] = "full"
@@ -74,6 +77,7 @@ class ForecastRequest:
     agents: tuple[str, ...] | None = None
     include_modes: bool = False
     sampling: Sampling = "iid"
+    horizons: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in ("full", "z_best", "gmm"):
@@ -82,8 +86,11 @@ class ForecastRequest:
             raise ValueError(f"sampling {self.sampling!r} is none of {', '.join(SAMPLINGS)}")
         if not 1 <= self.num_samples <= MAX_SAMPLES:
             raise ValueError(f"num_samples must be 1 to {MAX_SAMPLES}")
-        if not 1 <= self.horizon <= MAX_HORIZON:
-            raise ValueError(f"horizon must be 1 to {MAX_HORIZON} steps")
+        for steps in (self.horizon, *(self.horizons or ())):
+            if not 1 <= steps <= MAX_HORIZON:
+                raise ValueError(f"horizon must be 1 to {MAX_HORIZON} steps")
+        if self.horizons is not None and len(self.horizons) != len(self.agents or ()):
+            raise ValueError("horizons must be as many as agents")
         if not (0 <= self.seed < 2**63 and 0 <= self.step < 2**63):
             raise ValueError("seed and step must lie in 0 .. 2**63 - 1")
 
@@ -118,115 +125,147 @@ class SceneForecast:
     covariance: Float32 | None  # [A, Z, H, 3] xx, xy, yy
     samples: Float32 | None  # [A, S, H, 2]
     sample_modes: NDArray[np.int64] | None  # [A, S]
+    horizons: tuple[int, ...]  # [A] steps of each agent, H the most of them; zeros behind
+
+
+class _Agent(NamedTuple):
+    """One agent that is to be forecast."""
+
+    request: int
+    place: int  # in its forecast
+    row: int
+    id: str
+    horizon: int
 
 
 class _Agents(NamedTuple):
-    """B agents of one type that are decoded together over one horizon."""
+    """B agents of one type that are decoded together."""
 
+    agents: list[_Agent]  # by horizon: those of one length are decoded side by side
     encoding: Tensor  # [B, D]
     motion: Kinematics
     log_prior: Tensor  # [B, Z]
-    keys: list[tuple[int, int]]  # (request, position in its forecast)
-    ids: list[str]
+
+    def horizons(self, wanted: Sequence[int]) -> list[int]:
+        """Steps of some of the agents."""
+        return [self.agents[i].horizon for i in wanted]
 
 
 def forecast_scenes(
     model: Trajectron, states: Sequence[SceneState], requests: Sequence[ForecastRequest]
 ) -> list[SceneForecast]:
     """The futures that each request asks of its state; see ``Trajectron.forecast``."""
-    if not states:
-        return []
-    with torch_alone():
-        return _forecast_scenes(model, states, requests)
+    return forecast_rows(model, rows_of(states), requests) if states else []
 
 
-def _forecast_scenes(
-    model: Trajectron, states: Sequence[SceneState], requests: Sequence[ForecastRequest]
+def forecast_rows(
+    model: Trajectron, rows: SceneRows, requests: Sequence[ForecastRequest]
 ) -> list[SceneForecast]:
-    picked = [_rows(model, s, r) for s, r in zip(states, requests, strict=True)]
-    results = [
-        _blank(model, s, r, rows) for s, r, rows in zip(states, requests, picked, strict=True)
-    ]
-    for (kind, horizon), agents in _groups(model, states, requests, picked).items():
-        for (request, at), row in zip(
-            agents.keys, agents.log_prior.exp().cpu().numpy(), strict=True
-        ):
-            results[request].mode_probabilities[at] = row
-        _fill_modes(model, kind, horizon, agents, requests, results)
-        _fill_samples(model, kind, horizon, agents, requests, results)
+    """The same of scenes whose agents stand beside each other, a request for each scene."""
+    with torch_alone():
+        picked = [
+            _picked(model, rows, number, first, request)
+            for number, (first, request) in enumerate(zip(rows.firsts[:-1], requests, strict=True))
+        ]
+        results = _blank(model, rows, requests, picked)
+        for kind, agents in _groups(model, rows, requests, picked):
+            probabilities = agents.log_prior.exp().cpu().numpy()
+            for agent, row in zip(agents.agents, probabilities, strict=True):
+                results[agent.request].mode_probabilities[agent.place] = row
+            _fill_modes(model, kind, agents, requests, results)
+            _fill_samples(model, kind, agents, requests, results)
     return results
 
 
-def _rows(model: Trajectron, state: SceneState, request: ForecastRequest) -> list[int]:
+def _picked(
+    model: Trajectron, rows: SceneRows, number: int, first: int, request: ForecastRequest
+) -> list[_Agent]:
+    """The agents that a request asks for; its scene's rows begin at ``first``."""
+    ids = rows.ids[number]
     if request.agents is None:
         stationary = [t.stationary for t in model.config.types]
-        return [row for row, kind in enumerate(state.node_type.tolist()) if not stationary[kind]]
-    row_of = {agent: row for row, agent in enumerate(state.ids)}
-    unknown = [agent for agent in request.agents if agent not in row_of]
-    if unknown:
-        raise KeyError(f"no agent {unknown[0]!r} in the scene")
-    return [row_of[agent] for agent in request.agents]
+        kinds = rows.node_type[first : first + len(ids)].tolist()
+        places = [place for place, kind in enumerate(kinds) if not stationary[kind]]
+    else:
+        place_of = {agent: place for place, agent in enumerate(ids)}
+        unknown = [agent for agent in request.agents if agent not in place_of]
+        if unknown:
+            raise KeyError(f"no agent {unknown[0]!r} in the scene")
+        places = [place_of[agent] for agent in request.agents]
+    horizons = request.horizons or (request.horizon,) * len(places)
+    return [
+        _Agent(number, at, first + place, ids[place], horizon)
+        for at, (place, horizon) in enumerate(zip(places, horizons, strict=True))
+    ]
 
 
 def _blank(
-    model: Trajectron, state: SceneState, request: ForecastRequest, rows: list[int]
-) -> SceneForecast:
-    """A forecast whose arrays are still to be filled."""
-    agents, values, horizon = len(rows), model.config.latent_values, request.horizon
-    names = model.config.node_types
-    index = torch.tensor(rows, dtype=torch.int64, device=state.node_type.device)
-    shape = (agents, values, horizon)
-    return SceneForecast(
-        ids=tuple(state.ids[row] for row in rows),
-        types=tuple(names[kind] for kind in state.node_type[index].tolist()),
-        position=state.motion.position[index].cpu().numpy(),
-        last_seen_s=state.motion.last_seen_s[index].cpu().numpy(),
-        observations=state.motion.observations[index].cpu().numpy(),
-        heading_known=state.motion.heading_known[index].cpu().numpy(),
-        mode_probabilities=np.zeros((agents, values), dtype=np.float32),
-        mean=np.zeros((*shape, 2), dtype=np.float32) if request.modes else None,
-        covariance=np.zeros((*shape, 3), dtype=np.float32) if request.modes else None,
-        samples=(
-            np.zeros((agents, request.samples, horizon, 2), dtype=np.float32)
-            if request.samples
-            else None
-        ),
-        sample_modes=(
-            np.zeros((agents, request.samples), dtype=np.int64) if request.samples else None
-        ),
-    )
+    model: Trajectron,
+    rows: SceneRows,
+    requests: Sequence[ForecastRequest],
+    picked: Sequence[Sequence[_Agent]],
+) -> list[SceneForecast]:
+    """Forecasts whose arrays are still to be filled."""
+    names, values = model.config.node_types, model.config.latent_values
+    motion = rows.motion
+    columns = [
+        column.cpu().numpy()
+        for column in (
+            motion.position,
+            motion.last_seen_s,
+            motion.observations,
+            motion.heading_known,
+        )
+    ]
+    blank = []
+    for request, agents in zip(requests, picked, strict=True):
+        index = np.array([agent.row for agent in agents], dtype=np.int64)
+        position, last_seen_s, observations, heading_known = (column[index] for column in columns)
+        horizons = tuple(agent.horizon for agent in agents)
+        steps, samples = max(horizons, default=request.horizon), request.samples
+        shape = (len(agents), values, steps)
+        forecast = SceneForecast(
+            ids=tuple(agent.id for agent in agents),
+            types=tuple(names[kind] for kind in rows.node_type[index].tolist()),
+            position=position,
+            last_seen_s=last_seen_s,
+            observations=observations,
+            heading_known=heading_known,
+            mode_probabilities=np.zeros(shape[:2], dtype=np.float32),
+            mean=np.zeros((*shape, 2), dtype=np.float32) if request.modes else None,
+            covariance=np.zeros((*shape, 3), dtype=np.float32) if request.modes else None,
+            samples=(
+                np.zeros((len(agents), samples, steps, 2), dtype=np.float32) if samples else None
+            ),
+            sample_modes=np.zeros((len(agents), samples), dtype=np.int64) if samples else None,
+            horizons=horizons,
+        )
+        blank.append(forecast)
+    return blank
 
 
 def _groups(
     model: Trajectron,
-    states: Sequence[SceneState],
+    rows: SceneRows,
     requests: Sequence[ForecastRequest],
-    picked: list[list[int]],
-) -> dict[tuple[int, int], _Agents]:
-    """Agents of all requests by (type, horizon), encoded."""
-    stacked = stack(states)
-    kinds = stacked.node_type.tolist()
-    members: dict[tuple[int, int], list[tuple[int, int, int]]] = defaultdict(list)
-    first = 0
-    for number, (state, request, rows) in enumerate(zip(states, requests, picked, strict=True)):
-        for at, row in enumerate(rows):
-            members[kinds[first + row], request.horizon].append((number, at, first + row))
-        first += len(state.ids)
-    groups = {}
-    for (kind, horizon), found in members.items():
-        index = torch.tensor([row for _, _, row in found], device=stacked.node_type.device)
+    picked: Sequence[Sequence[_Agent]],
+) -> Iterator[tuple[int, _Agents]]:
+    """Agents of all requests by type, encoded."""
+    members: dict[int, list[_Agent]] = defaultdict(list)
+    kinds = rows.node_type.tolist()
+    for agents in picked:
+        for agent in agents:
+            members[kinds[agent.row]].append(agent)
+    for kind, found in members.items():
+        found.sort(key=attrgetter("horizon"))
+        index = torch.tensor([agent.row for agent in found], device=rows.influence.device)
         networks = model.node_model(kind)
         encoding = networks.encoding(
-            EncoderState(*(column[index] for column in stacked.encoder)), stacked.influence[index]
+            EncoderState(*(column[index] for column in rows.encoder)), rows.influence[index]
         )
-        groups[kind, horizon] = _Agents(
-            encoding=encoding,
-            motion=Kinematics(*(column[index] for column in stacked.motion)),
-            log_prior=_prior(networks, encoding, [requests[number] for number, _, _ in found]),
-            keys=[(number, at) for number, at, _ in found],
-            ids=[stacked.ids[row] for _, _, row in found],
-        )
-    return groups
+        motion = Kinematics(*(column[index] for column in rows.motion))
+        log_prior = _prior(networks, encoding, [requests[agent.request] for agent in found])
+        yield kind, _Agents(found, encoding, motion, log_prior)
 
 
 def _prior(networks: NodeModel, encoding: Tensor, asked: Sequence[ForecastRequest]) -> Tensor:
@@ -241,42 +280,48 @@ def _prior(networks: NodeModel, encoding: Tensor, asked: Sequence[ForecastReques
 def _fill_modes(
     model: Trajectron,
     kind: int,
-    horizon: int,
     agents: _Agents,
     requests: Sequence[ForecastRequest],
     results: list[SceneForecast],
 ) -> None:
-    wanted = [i for i, (number, _) in enumerate(agents.keys) if requests[number].modes]
+    wanted = [i for i, agent in enumerate(agents.agents) if requests[agent.request].modes]
     if not wanted:
         return
     index = torch.tensor(wanted, device=agents.encoding.device)
     motion = Kinematics(*(column[index] for column in agents.motion))
     mean, covariance = mode_moments(
-        model, kind, agents.encoding[index], agents.log_prior[index], motion, horizon
+        model,
+        kind,
+        agents.encoding[index],
+        agents.log_prior[index],
+        motion,
+        torch.tensor(agents.horizons(wanted), device=index.device),
     )
-    means, covariances = mean.cpu().numpy(), covariance.cpu().numpy()
-    for row, i in enumerate(wanted):
-        number, at = agents.keys[i]
-        result = results[number]
+    for i, mean_of, covariance_of in zip(
+        wanted, mean.cpu().numpy(), covariance.cpu().numpy(), strict=True
+    ):
+        agent = agents.agents[i]
+        result = results[agent.request]
         assert result.mean is not None and result.covariance is not None
-        result.mean[at], result.covariance[at] = means[row], covariances[row]
+        result.mean[agent.place, :, : agent.horizon] = mean_of[:, : agent.horizon]
+        result.covariance[agent.place, :, : agent.horizon] = covariance_of[:, : agent.horizon]
 
 
 def _fill_samples(
     model: Trajectron,
     kind: int,
-    horizon: int,
     agents: _Agents,
     requests: Sequence[ForecastRequest],
     results: list[SceneForecast],
 ) -> None:
-    wanted = [i for i, (number, _) in enumerate(agents.keys) if requests[number].samples]
+    wanted = [i for i, agent in enumerate(agents.agents) if requests[agent.request].samples]
     if not wanted:
         return
     device = agents.encoding.device
-    latent, turn, component, normal = _noise(wanted, agents, requests, horizon)
-    counts = [requests[agents.keys[i][0]].samples for i in wanted]
-    best = [requests[agents.keys[i][0]].mode == "z_best" for i in wanted]
+    asked = [requests[agents.agents[i].request] for i in wanted]
+    latent, turn, component, normal = _noise(wanted, agents, requests)
+    counts = [request.samples for request in asked]
+    best = [request.mode == "z_best" for request in asked]
     repeats = torch.tensor(counts, device=device)
     agent = torch.tensor(wanted, device=device).repeat_interleave(repeats)  # [R]
     prior = agents.log_prior.exp()
@@ -290,28 +335,35 @@ def _fill_samples(
     values, latents = offsets.cpu().numpy(), modes.cpu().numpy()
     ends = np.cumsum(counts)
     for i, last, count in zip(wanted, ends, counts, strict=True):
-        number, at = agents.keys[i]
-        result = results[number]
+        one = agents.agents[i]
+        result = results[one.request]
         assert result.samples is not None and result.sample_modes is not None
-        result.samples[at] = values[last - count : last]
-        result.sample_modes[at] = latents[last - count : last]
+        result.samples[one.place, :, : one.horizon] = values[last - count : last, : one.horizon]
+        result.sample_modes[one.place] = latents[last - count : last]
 
 
 def _noise(
-    wanted: Sequence[int], agents: _Agents, requests: Sequence[ForecastRequest], horizon: int
+    wanted: Sequence[int], agents: _Agents, requests: Sequence[ForecastRequest]
 ) -> list[Tensor]:
     """Latent [R], turn [R], component [R, H] and normal [R, H, 2] of all samples of agents."""
+    steps = max(agents.horizons(wanted))
     drawn = []
-    for number, rows in groupby(wanted, key=lambda i: agents.keys[i][0]):
-        asked, ids = requests[number], [agents.ids[i] for i in rows]
-        drawn.append(
-            scene_noise(asked.seed, ids, asked.step, asked.samples, horizon, asked.sampling)
-        )
-    columns = [
-        np.concatenate([part.reshape(-1, *part.shape[2:]) for part in column])  # [R, ...]
-        for column in zip(*drawn, strict=True)
-    ]
+    of_request = attrgetter("request", "horizon")
+    for (number, horizon), same in groupby((agents.agents[i] for i in wanted), key=of_request):
+        asked, ids = requests[number], [agent.id for agent in same]
+        noise = scene_noise(asked.seed, ids, asked.step, asked.samples, horizon, asked.sampling)
+        drawn.append([_longer(part.reshape(-1, *part.shape[2:]), steps) for part in noise])
+    columns = [np.concatenate(column) for column in zip(*drawn, strict=True)]  # [R, ...]
     return [torch.from_numpy(column).to(agents.encoding.device) for column in columns]
+
+
+def _longer(noise: Float32, steps: int) -> Float32:
+    """Noise [R, H', ...] for so many steps, zeros behind; [R] stays."""
+    if noise.ndim == 1 or noise.shape[1] == steps:
+        return noise
+    longer = np.zeros((len(noise), steps, *noise.shape[2:]), dtype=np.float32)
+    longer[:, : noise.shape[1]] = noise
+    return longer
 
 
 def _sample_offsets(
@@ -329,7 +381,9 @@ def _sample_offsets(
     velocity = start_velocity(model, agents.motion, kind)
     prepared = networks.decoder.prepare(agents.encoding, velocity)
     limit = agent_type.speed_limit_mps / agent_type.speed_scale_mps
-    sampled = networks.decoder.sample(prepared, agent, modes, component, normal, limit)
+    steps = component.shape[1]  # enough for those that are sampled
+    horizons = torch.tensor([min(one.horizon, steps) for one in agents.agents], device=agent.device)
+    sampled = networks.decoder.sample(prepared, agent, modes, component, normal, limit, horizons)
     angle = turn * (2.0 * math.pi)
     any_axis = torch.stack([angle.cos(), angle.sin()], dim=-1)
     axis = model.features.frame(agents.motion)[agent]

@@ -64,7 +64,7 @@ def mode_moments(
     encoding: Tensor,
     log_prior: Tensor,
     motion: Kinematics,
-    horizon: int,
+    horizons: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Position-space Gaussian of every latent value at every step.
 
@@ -73,10 +73,11 @@ def mode_moments(
         encoding: [N, D] h_enc.
         log_prior: [N, Z] log p(z|x); a mode of -inf repeats the most probable one.
         motion: of the N nodes.
-        horizon: H.
+        horizons: [N] steps of each node, H the most of them.
 
     Returns:
-        mean [N, Z, H, 2] as offsets in metres and covariance [N, Z, H, 3], world axes.
+        mean [N, Z, H, 2] as offsets in metres and covariance [N, Z, H, 3], world axes; behind
+        a node's own steps they mean nothing.
     """
     agent_type, dt_s = model.config.types[kind], model.config.dt_s
     decoder, scale = model.node_model(kind).decoder, agent_type.speed_scale_mps
@@ -84,7 +85,7 @@ def mode_moments(
     stays = log_prior > -torch.inf
     agent, latent = stays.nonzero(as_tuple=True)  # [R]
     limit = agent_type.speed_limit_mps / scale
-    velocity, increment = decoder.moments(prepared, agent, latent, horizon, limit)
+    velocity, increment = decoder.moments(prepared, agent, latent, horizons, limit)
     if agent_type.stationary:
         increment = torch.zeros_like(increment)
     mean = integrate(velocity, dt_s) * scale  # [R, H, 2]

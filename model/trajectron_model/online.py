@@ -1,4 +1,4 @@
-"""Packed scenes stepped online: by a kernel in one call where it can, else by ``Trajectron.step``.
+"""Packed scenes stepped and forecast online: by kernels where they can, else by torch.
 
 There is one model and one step: the kernel computes what ``Trajectron.step`` does, on the
 records of ``packed``; a test streams recordings through both and compares.
@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from trajectron_model import graph
+from trajectron_model import graph, packed
 from trajectron_model.config import ModelConfig
+from trajectron_model.forecast import ForecastRequest, SceneForecast, forecast_rows
 from trajectron_model.kernels import stepping
 from trajectron_model.kernels.loading import Kernels
 from trajectron_model.kernels.packing import PackedWeights, library_for
@@ -39,9 +40,9 @@ def step(
         layout = Layout.of(model.config)
         stepped = model.step([state_of(model, scene) for scene in scenes], frames)
         return [pack(state, layout) for state in stepped]
-    packed = _WEIGHTS.of(model, library)
+    weights = _WEIGHTS.of(model, library)
     admitted = [
-        _admit(scene, frame, model.config, packed.layout)
+        _admit(scene, frame, model.config, weights.layout)
         for scene, frame in zip(scenes, frames, strict=True)
     ]
     rows = stepping.SceneRows(
@@ -50,9 +51,9 @@ def step(
         observed=[observed for _, observed in admitted],
         positions=[frame.positions for frame in frames],
         times_s=[frame.time_s for frame in frames],
-        layout=packed.layout,
+        layout=weights.layout,
     )
-    after = stepping.step(library, packed, rows)
+    after = stepping.step(library, weights, rows)
     return [
         PackedScene(scene.ids, nodes, edges, frame.time_s)
         for (scene, _), frame, (nodes, edges) in zip(admitted, frames, after, strict=True)
@@ -62,6 +63,13 @@ def step(
 def state_of(model: Trajectron, scene: PackedScene) -> SceneState:
     """The scene as tensors, where the model's weights are."""
     return unpack(scene, model.config, model.device)
+
+
+def forecast(
+    model: Trajectron, scenes: Sequence[PackedScene], requests: Sequence[ForecastRequest]
+) -> list[SceneForecast]:
+    """``Trajectron.forecast`` of packed scenes."""
+    return forecast_rows(model, packed.rows_of(scenes, model.config, model.device), requests)
 
 
 def _admit(

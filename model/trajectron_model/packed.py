@@ -16,6 +16,7 @@ import math
 import struct
 import sys
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from trajectron_model.config import ModelConfig
 from trajectron_model.encoders import EncoderState
 from trajectron_model.features import Kinematics
 from trajectron_model.graph import Graph
+from trajectron_model.rows import SceneRows
 from trajectron_model.state import SceneEdge, SceneState, blank_state
 
 Records = NDArray[np.void]
@@ -214,34 +216,46 @@ def pack(state: SceneState, layout: Layout) -> PackedScene:
 
 def unpack(scene: PackedScene, config: ModelConfig, device: torch.device) -> SceneState:
     """The scene as tensors."""
-    layout = Layout.of(config)
     if not scene.ids:
         return blank_state(config, device)._replace(time_s=scene.time_s)
-    nodes = np.frombuffer(scene.nodes, dtype=layout.node)
     edges = np.frombuffer(scene.edges, dtype=EDGE)
+    counters = Graph(*(edges[name].astype(np.int64) for name in Graph._fields))
+    rows = rows_of([scene], config, device)
+    return SceneState(
+        ids=scene.ids,
+        node_type=torch.from_numpy(rows.node_type).to(device),
+        motion=rows.motion,
+        encoder=rows.encoder,
+        graph=counters,
+        modulation=graph.modulation(counters.age, counters.gone, config),
+        influence=rows.influence,
+        time_s=scene.time_s,
+    )
+
+
+def rows_of(scenes: Sequence[PackedScene], config: ModelConfig, device: torch.device) -> SceneRows:
+    """The agents of scenes as tensors, read in one go."""
+    layout = Layout.of(config)
+    nodes = np.frombuffer(b"".join([scene.nodes for scene in scenes]), dtype=layout.node)
 
     def column(name: str) -> Tensor:
         return torch.from_numpy(np.array(nodes[name])).to(device)
 
-    counters = Graph(*(edges[name].astype(np.int64) for name in Graph._fields))
     motion = {
         name: column(name)
         for name in Kinematics._fields
         if name not in ("observations", "heading_known")
     }
-    return SceneState(
-        ids=scene.ids,
-        node_type=column("type").long(),
+    return SceneRows(
+        ids=tuple(scene.ids for scene in scenes),
+        node_type=nodes["type"].astype(np.int64),
         motion=Kinematics(
             **motion,
             observations=column("observations").long(),
             heading_known=column("heading_known").bool(),
         ),
         encoder=EncoderState(*(column(name) for name in EncoderState._fields)),
-        graph=counters,
-        modulation=graph.modulation(counters.age, counters.gone, config),
         influence=column("influence"),
-        time_s=scene.time_s,
     )
 
 

@@ -1,4 +1,4 @@
-"""Forecast tasks as requests of the model: agents drawn together by how long they are away.
+"""Forecast tasks as requests of the model.
 
 **Missing agents.** An agent that is not in the newest frame is forecast from its last observed
 position, but its offsets hold at the same times as everybody's: the model is run that many
@@ -10,16 +10,16 @@ longest horizon, the last step's change is held.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trajectron_model import online
 from trajectron_model.config import MAX_HORIZON, ModelConfig
 from trajectron_model.forecast import ForecastRequest, SceneForecast
-from trajectron_model.state import SceneState
+from trajectron_model.packed import Layout, PackedScene
 from trajectron_model.trajectron import Trajectron
 from trajectron_service.messages import AgentForecast
 from trajectron_service.scenes import ForecastTask
@@ -30,55 +30,49 @@ _WHOLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Draw:
-    """The part of a forecast task that has one number of steps away."""
+    """A forecast task, and how many steps each of its agents has been away."""
 
     task: ForecastTask
-    state: SceneState
     agents: tuple[str, ...]
-    steps_away: float
+    steps_away: tuple[float, ...]
 
     @property
     def request(self) -> ForecastRequest:
-        """What the model is asked: the horizon, and the steps that are left out again."""
+        """What the model is asked: the horizons, and the steps that are left out again."""
         task = self.task
         return ForecastRequest(
             mode=task.mode.value,
             num_samples=task.num_samples,
-            horizon=min(task.horizon + math.ceil(self.steps_away), MAX_HORIZON),
+            horizon=task.horizon,
             seed=task.seed,
             step=task.step,
             agents=self.agents,
             include_modes=task.include_modes,
             sampling=task.sampling.value,
+            horizons=tuple(
+                min(task.horizon + math.ceil(steps), MAX_HORIZON) for steps in self.steps_away
+            ),
         )
 
 
 def forecast_all(
-    network: Trajectron, tasks: Sequence[ForecastTask], states: Sequence[SceneState]
+    network: Trajectron, tasks: Sequence[ForecastTask], scenes: Sequence[PackedScene]
 ) -> list[tuple[AgentForecast, ...]]:
-    """The forecasts of all tasks, drawn together."""
-    draws = [_draws(task, state, network.config) for task, state in zip(tasks, states, strict=True)]
-    flat = [draw for of_task in draws for draw in of_task]
-    drawn = network.forecast([draw.state for draw in flat], [draw.request for draw in flat])
-    by_draw = dict(zip(map(id, flat), drawn, strict=True))
-    answers = []
-    for of_task in draws:
-        found: dict[str, AgentForecast] = {}
-        for draw in of_task:
-            found |= {one.id: one for one in _agents(by_draw[id(draw)], draw)}
-        order = of_task[0].task.agents or of_task[0].state.ids if of_task else ()
-        answers.append(tuple(found[agent] for agent in order if agent in found))
-    return answers
+    """The forecasts of all tasks, each from its scene, drawn together."""
+    draws = [_draw(task, scene, network.config) for task, scene in zip(tasks, scenes, strict=True)]
+    drawn = online.forecast(network, scenes, [draw.request for draw in draws])
+    return [_agents(one, draw) for one, draw in zip(drawn, draws, strict=True)]
 
 
-def _draws(task: ForecastTask, state: SceneState, config: ModelConfig) -> list[_Draw]:
-    """The task, cut by how many steps its agents have been away; nothing for an empty scene.
+def _draw(task: ForecastTask, scene: PackedScene, config: ModelConfig) -> _Draw:
+    """The task, with how many steps its agents have been away.
 
     Agents that cannot move are left out unless they are asked for, as are those of other shares.
     """
-    away = (task.head.time_s - state.last_seen_s.numpy()) / config.dt_s  # [N]
+    records = np.frombuffer(scene.nodes, dtype=Layout.of(config).node)
+    away = (task.head.time_s - records["last_seen_s"]) / config.dt_s  # [N]
     away = np.where(np.abs(away - np.rint(away)) < _WHOLE, np.rint(away), away)
-    rows = zip(state.ids, state.node_type.tolist(), away.tolist(), strict=True)
+    rows = zip(scene.ids, records["type"].tolist(), away.tolist(), strict=True)
     if task.agents is None:
         wanted = [
             (agent, steps) for agent, kind, steps in rows if not config.types[kind].stationary
@@ -87,21 +81,22 @@ def _draws(task: ForecastTask, state: SceneState, config: ModelConfig) -> list[_
         steps_away = {agent: steps for agent, _, steps in rows}
         wanted = [(agent, steps_away[agent]) for agent in task.agents]
     share, shares = task.share
-    groups: dict[float, list[str]] = defaultdict(list)
-    for agent, steps in wanted[len(wanted) * share // shares : len(wanted) * (share + 1) // shares]:
-        groups[steps].append(agent)
-    return [_Draw(task, state, tuple(agents), steps) for steps, agents in groups.items()]
+    first, last = (len(wanted) * part // shares for part in (share, share + 1))
+    mine = wanted[first:last]
+    return _Draw(task, tuple(agent for agent, _ in mine), tuple(steps for _, steps in mine))
 
 
-def _agents(drawn: SceneForecast, draw: _Draw) -> list[AgentForecast]:
+def _agents(drawn: SceneForecast, draw: _Draw) -> tuple[AgentForecast, ...]:
     """One model forecast, agent by agent, with the steps before the newest frame left out."""
-    horizon, away = draw.task.horizon, draw.steps_away
 
     def ahead(array: NDArray[np.float32] | None, row: int) -> NDArray[np.float32] | None:
-        return None if array is None else _ahead(array[row], horizon, away)
+        if array is None:
+            return None
+        own = array[row, :, : drawn.horizons[row]]
+        return _ahead(own, draw.task.horizon, draw.steps_away[row])
 
     modes = drawn.sample_modes
-    return [
+    return tuple(
         AgentForecast(
             id=agent,
             type=drawn.types[row],
@@ -117,7 +112,7 @@ def _agents(drawn: SceneForecast, draw: _Draw) -> list[AgentForecast]:
             sample_modes=None if modes is None else modes[row],
         )
         for row, agent in enumerate(drawn.ids)
-    ]
+    )
 
 
 def _ahead(array: NDArray[np.float32], horizon: int, away: float) -> NDArray[np.float32]:

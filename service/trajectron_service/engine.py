@@ -144,8 +144,7 @@ class Engine:
                 graphs[i] = _graph(network, scene)
             if asked:
                 tasks = [task for _, task in asked]
-                live = [online.state_of(network, scene) for scene in states[: len(asked)]]
-                drawn = forecast_all(network, tasks, live)
+                drawn = forecast_all(network, tasks, states[: len(asked)])
                 for (i, _), agents in zip(asked, drawn, strict=True):
                     forecasts[i].append(agents)
                 self._observe("sample", time.perf_counter() - stepped)

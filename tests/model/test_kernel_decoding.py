@@ -47,7 +47,7 @@ class RoundedDecoder(Decoder):
 
 
 def on_grid(hidden: Tensor) -> Tensor:
-    return (hidden * 2**FRACTION_BITS).round() / 2**FRACTION_BITS
+    return (hidden * float(2**FRACTION_BITS)).round() / float(2**FRACTION_BITS)
 
 
 def rounded(decoder: Decoder) -> RoundedDecoder:
@@ -63,7 +63,7 @@ def rounded(decoder: Decoder) -> RoundedDecoder:
 
 
 def as_floats(rows: FixedRows) -> Tensor:
-    return rows.integers * rows.scale.unsqueeze(1) * 2**FRACTION_BITS
+    return rows.integers * (rows.scale * float(2**FRACTION_BITS)).unsqueeze(1)
 
 
 def assert_near(ours: Tensor, theirs: Tensor, middle: float) -> None:
@@ -145,10 +145,11 @@ def test_moments_are_torchs(name: str, agents: int, horizon: int) -> None:
     found = []
     with torch.inference_mode():
         every = asked.decoder.every_latent(agents)
+        steps = torch.full((agents,), horizon)
         for decoder in (asked.decoder, rounded(asked.decoder)):
-            found.append(asked.decoder.moments(asked.prepared, *every, horizon, LIMIT))
+            found.append(asked.decoder.moments(asked.prepared, *every, steps, LIMIT))
             with by_torch():
-                found.append(decoder.moments(asked.prepared, *every, horizon, LIMIT))
+                found.append(decoder.moments(asked.prepared, *every, steps, LIMIT))
     ours, exact, _, theirs = found
     for one, close, near in zip(ours, theirs, exact, strict=True):
         assert_near(one, close, 3e-4)
@@ -193,12 +194,36 @@ def test_moments_are_the_same_to_the_last_bit_whatever_stands_beside_them() -> N
     asked = case("default", agents=6)
     decoder = asked.decoder
     with torch.inference_mode():
-        everything = decoder.moments(asked.prepared, *decoder.every_latent(6), 5, LIMIT)
+        everything = decoder.moments(
+            asked.prepared, *decoder.every_latent(6), torch.full((6,), 5), LIMIT
+        )
         alone = Prepared(*(column[2:3] for column in asked.prepared))
         values = decoder.gates_latent.num_embeddings
-        found = decoder.moments(alone, *decoder.every_latent(1), 5, LIMIT)
+        found = decoder.moments(alone, *decoder.every_latent(1), torch.tensor([5]), LIMIT)
         for one, all_ in zip(found, everything, strict=True):
             assert torch.equal(one, all_[2 * values : 3 * values])
+
+
+def test_an_agents_own_steps_do_not_depend_on_how_many_others_have() -> None:
+    asked, own = case("default", agents=6), torch.tensor([5, 6, 1, 2, 6, 3])
+    decoder = asked.decoder
+    with torch.inference_mode():
+        every = decoder.every_latent(6)
+        whole = decoder.moments(asked.prepared, *every, torch.full((6,), 6), LIMIT)
+        cut = decoder.moments(asked.prepared, *every, own, LIMIT)
+        for all_, some in zip(whole, cut, strict=True):
+            for row, agent in enumerate(every[0]):
+                assert torch.equal(all_[row, : own[agent]], some[row, : own[agent]])
+        drawn = decoder.sample(*asked[1:], LIMIT, own)
+    for row, agent in enumerate(asked.agent):
+        assert torch.equal(drawn[row, : own[agent]], asked.sample()[row, : own[agent]])
+
+
+@pytest.mark.parametrize("wrong", [torch.tensor([6]), torch.full((5,), 7)])
+def test_horizons_out_of_range_are_refused(wrong: Tensor) -> None:
+    asked = case("default")
+    with torch.inference_mode(), pytest.raises(IndexError):
+        asked.decoder.sample(*asked[1:], LIMIT, wrong)
 
 
 def test_threads_share_the_work_and_change_nothing() -> None:

@@ -58,8 +58,9 @@ typedef struct {
     const int64_t *order;  /* [R] rows as they are taken: those that share a start stand together */
     const int64_t *agent;  /* [R] */
     const int64_t *latent; /* [R] */
-    int64_t horizon;
-    float limit; /* on speed */
+    const int64_t *horizons; /* [N] steps of each agent's rows */
+    int64_t horizon;         /* the most of them: rows are so long in arrays */
+    float limit;             /* on speed */
 } Rollouts;
 
 /* What a block works on. */
@@ -237,6 +238,16 @@ static void begin_block(const Decoder *decoder, const Rollouts *all, long first,
     for (long i = filled; i < BLOCK_ROWS; i++) block->velocity[0][i] = block->velocity[1][i] = 0.0f;
 }
 
+/* The most steps that a row of the block has. */
+static int64_t steps_of(const Rollouts *all, long rows, const Block *block) {
+    int64_t most = 0;
+    for (long i = 0; i < rows; i++) {
+        const int64_t steps = all->horizons[all->agent[block->row[i]]];
+        most = steps > most ? steps : most;
+    }
+    return most;
+}
+
 /* The next step of all rows. */
 static void advance(const Decoder *decoder, long filled, Block *block) {
     step_cells(decoder, filled, block->start_of, block->velocity, block->hidden, block->next,
@@ -338,7 +349,8 @@ static void draw(const Decoder *decoder, float limit, Block *block, long first) 
     vf_store(block->velocity[1] + first, y);
 }
 
-/* Sampled velocities [R][horizon][2] of the rows at [first, last) of the order.
+/* Sampled velocities [R][horizon][2] of the rows at [first, last) of the order; what is behind a
+ * row's own steps is either left as it was or goes on.
  *
  * uniform: [R][horizon] chooses components; normal: [R][horizon][2]; workspace: of
  * trajectron_decode_workspace bytes, aligned to 64, to this call alone.
@@ -352,7 +364,8 @@ KERNEL void trajectron_decode_sample(const Decoder *decoder, const Rollouts *all
         const long rows = last - first < BLOCK_ROWS ? last - first : BLOCK_ROWS;
         const long filled = whole_tiles(rows);
         begin_block(decoder, all, first, rows, block);
-        for (int64_t t = 0; t < horizon; t++) {
+        const int64_t steps = steps_of(all, rows, block);
+        for (int64_t t = 0; t < steps; t++) {
             if (t > 0) advance(decoder, filled, block);
             weigh(decoder, filled, block);
             for (long i = 0; i < rows; i++) {
@@ -419,7 +432,8 @@ static void merge(const Decoder *decoder, const float *raw, float *mean, float *
 }
 
 /* Rollouts on the mixture's mean, limited in speed, of the rows at [first, last) of the order:
- * velocities [R][horizon][2] and covariances of their changes [R][horizon][3].
+ * velocities [R][horizon][2] and covariances of their changes [R][horizon][3], up to each
+ * row's own steps as above.
  */
 KERNEL void trajectron_decode_moments(const Decoder *decoder, const Rollouts *all, float *velocity,
                                       float *covariance, int64_t first, int64_t last,
@@ -430,7 +444,8 @@ KERNEL void trajectron_decode_moments(const Decoder *decoder, const Rollouts *al
         const long rows = last - first < BLOCK_ROWS ? last - first : BLOCK_ROWS;
         const long filled = whole_tiles(rows);
         begin_block(decoder, all, first, rows, block);
-        for (int64_t t = 0; t < horizon; t++) {
+        const int64_t steps = steps_of(all, rows, block);
+        for (int64_t t = 0; t < steps; t++) {
             if (t > 0) advance(decoder, filled, block);
             read_mixture(decoder, filled, block);
             for (long i = 0; i < rows; i++) {

@@ -50,7 +50,7 @@ class _DecoderStruct(ctypes.Structure):
 class _RolloutsStruct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("gates", "state", "velocity")),
-        *((name, ctypes.c_void_p) for name in ("order", "agent", "latent")),
+        *((name, ctypes.c_void_p) for name in ("order", "agent", "latent", "horizons")),
         ("horizon", ctypes.c_int64),
         ("limit", ctypes.c_float),
     )
@@ -71,7 +71,7 @@ class _Asked(NamedTuple):
     prepared: Prepared
     agent: Tensor  # [R]
     latent: Tensor  # [R]
-    horizon: int
+    horizons: Tensor  # [N]
     limit: float
 
 
@@ -83,6 +83,7 @@ def sample(
     uniform: Tensor,
     normal: Tensor,
     limit: float,
+    horizons: Tensor,
 ) -> Tensor | None:
     """``Decoder.sample`` by the kernel; None where torch has to do it."""
     library = library_for(decoder.head.weight, *prepared, uniform, normal)
@@ -91,27 +92,33 @@ def sample(
     rows, horizon = uniform.shape
     assert normal.shape == (rows, horizon, 2)
     uniform, normal = uniform.contiguous(), normal.contiguous()
-    out = torch.empty_like(normal)
+    out = torch.zeros_like(normal)
     function = library.library.trajectron_decode_sample
     pointers = [_pointer(t) for t in (uniform, normal, out)]
-    asked = _Asked(prepared, agent, latent, horizon, limit)
-    _run(decoder, library, asked, function, pointers)
+    asked = _Asked(prepared, agent, latent, horizons, limit)
+    _run(decoder, library, asked, horizon, function, pointers)
     return out
 
 
 def moments(
-    decoder: Decoder, prepared: Prepared, agent: Tensor, latent: Tensor, horizon: int, limit: float
+    decoder: Decoder,
+    prepared: Prepared,
+    agent: Tensor,
+    latent: Tensor,
+    horizons: Tensor,
+    limit: float,
 ) -> tuple[Tensor, Tensor] | None:
     """``Decoder.moments`` by the kernel; None where torch has to do it."""
     library = library_for(decoder.head.weight, *prepared)
     if library is None:
         return None
-    means = prepared.velocity.new_empty(len(agent), horizon, 2)
-    covariances = prepared.velocity.new_empty(len(agent), horizon, 3)
+    horizon = int(horizons.max()) if horizons.numel() else 0
+    means = prepared.velocity.new_zeros(len(agent), horizon, 2)
+    covariances = prepared.velocity.new_zeros(len(agent), horizon, 3)
     function = library.library.trajectron_decode_moments
     pointers = [_pointer(means), _pointer(covariances)]
-    asked = _Asked(prepared, agent, latent, horizon, limit)
-    _run(decoder, library, asked, function, pointers)
+    asked = _Asked(prepared, agent, latent, horizons, limit)
+    _run(decoder, library, asked, horizon, function, pointers)
     return means, covariances
 
 
@@ -119,13 +126,15 @@ def _run(
     decoder: Decoder,
     library: Kernels,
     asked: _Asked,
+    horizon: int,
     function: Callable[..., None],
     arrays: list[ctypes.c_void_p],
 ) -> None:
     """Calls the kernel on all rows, shared among threads.
 
     Raises:
-        IndexError: an agent or a latent value out of range: the kernel would read beyond.
+        IndexError: an agent, a latent value or a number of steps out of range: the kernel would
+            read beyond.
     """
     prepared = asked.prepared
     agents, latents = asked.agent.contiguous().numpy(), asked.latent.contiguous().numpy()
@@ -136,6 +145,10 @@ def _run(
         raise IndexError(f"agents must be rows of {len(prepared.velocity)}")
     if latents.min() < 0 or latents.max() >= values:
         raise IndexError(f"latent values must lie in 0 .. {values - 1}")
+    horizons = asked.horizons.contiguous().numpy()
+    assert horizons.dtype == np.int64
+    if horizons.shape != (len(prepared.velocity),) or horizons.max() > horizon:
+        raise IndexError(f"each agent has a number of steps, at most {horizon}")
     gates, state, velocity = (column.contiguous() for column in prepared)
     assert gates.shape[1] == 4 * decoder.size and state.shape[1] == 2 * decoder.size
     order = _order(agents * values + latents, len(prepared.velocity) * values)
@@ -147,7 +160,8 @@ def _run(
         order.ctypes.data,
         agents.ctypes.data,
         latents.ctypes.data,
-        asked.horizon,
+        horizons.ctypes.data,
+        horizon,
         asked.limit,
     )
 
@@ -194,7 +208,9 @@ def _pack(decoder: Decoder, library: Kernels) -> _Packed:
         velocity,
         _gates_by_panel(decoder.gates_latent.weight.detach(), size, units, lanes),
         _wide(decoder.start_latent.weight.detach().reshape(-1, size), units),
-        *_panels(fixed_rows(_tall(_wide(weight[:components], units), logits)), _LOGIT_VECTORS, lanes),
+        *_panels(
+            fixed_rows(_tall(_wide(weight[:components], units), logits)), _LOGIT_VECTORS, lanes
+        ),
         _tall(bias[:components], logits, _NO_WEIGHT),
         *chosen,
         bias[components:].contiguous(),
