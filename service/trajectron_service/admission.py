@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
+import weakref
 from collections.abc import Callable
 
-from trajectron_service import tenancy
+from trajectron_service import logs, passes, tenancy
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.metrics import Metrics
+from trajectron_service.passes import Pass
 from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import Token, Tokens
 
 _SCHEME = "bearer"
+# How often the file is looked at, and passes are checked.
+LOOK_S = 1.0
 # A tenant may save up a second's worth of requests, one at least.
 _BURST_S = 1.0
+
+log = logs.get(__name__)
 
 
 class Admission:
@@ -35,9 +42,13 @@ class Admission:
         self._metrics = metrics
         self._clock = clock
         self._buckets: dict[str, _Bucket] = {}
+        self._passes: weakref.WeakSet[Pass] = weakref.WeakSet()
+        if tokens is not None:
+            metrics.tokens.set_function(lambda: len(tokens))
+            metrics.tokens_stale.set_function(lambda: float(tokens.stale))
 
     def admit(self, authorization: str | None, scope: Scope | None) -> None:
-        """Lets a call in, and has the running task work for its tenant.
+        """Lets a call in, and has the running task work for its tenant, under a pass.
 
         Args:
             authorization: the header or metadata of that name, ``Bearer TOKEN``.
@@ -50,21 +61,43 @@ class Admission:
             return
         try:
             token = self._bearer(self._tokens, authorization)
-            if scope not in token.scopes:
-                raise ServiceError(
-                    ErrorKind.PERMISSION_DENIED,
-                    f"this token has no scope {scope.value}, which the call needs",
-                )
+            refusal = _beyond(token, scope)
+            if refusal is not None:
+                raise refusal
             self._count(token)
         except ServiceError as error:
             self._metrics.refusals.labels(error.kind.value).inc()
             raise
         tenancy.enter(token.tenant)
+        held = _pass(self._tokens, token, scope)
+        self._passes.add(held)
+        passes.enter(held)
 
     def reload(self) -> None:
-        """Reads the file of tokens again, where there is one."""
+        """Reads the file of tokens again, where there is one, and ends streams accordingly."""
         if self._tokens is not None:
             self._tokens.reload()
+            self._check()
+
+    def look(self) -> None:
+        """Sees whether the file has changed, and ends streams whose token is not good any more."""
+        if self._tokens is not None:
+            self._tokens.look()
+            self._check()
+
+    async def keep_watch(self) -> None:
+        """Looks every second (``LOOK_S``), until cancelled."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            try:
+                self.look()
+            except Exception:
+                log.exception("tokens not looked at")
+
+    def _check(self) -> None:
+        ended = sum(held.check() for held in list(self._passes))
+        if ended:
+            log.info("streams ended, their tokens are not good any more", count=ended)
 
     def _bearer(self, tokens: Tokens, authorization: str | None) -> Token:
         scheme, _, presented = (authorization or "").partition(" ")
@@ -89,6 +122,28 @@ class Admission:
                 f"this token may make {token.requests_per_s:g} requests a second",
                 retry_after_s=wait_s,
             )
+
+
+def _pass(tokens: Tokens, token: Token, scope: Scope) -> Pass:
+    def fault() -> ServiceError | None:
+        now = tokens.again(token)
+        if now is None:
+            return ServiceError(
+                ErrorKind.UNAUTHENTICATED,
+                "the token that this was opened with has expired or was withdrawn",
+            )
+        return _beyond(now, scope)
+
+    return Pass(fault)
+
+
+def _beyond(token: Token, scope: Scope) -> ServiceError | None:
+    """The refusal where the token is not good for the scope."""
+    if scope in token.scopes:
+        return None
+    return ServiceError(
+        ErrorKind.PERMISSION_DENIED, f"this token has no scope {scope.value}, which the call needs"
+    )
 
 
 class _Bucket:

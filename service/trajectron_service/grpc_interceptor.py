@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import grpc
 from google.protobuf.message import DecodeError
 
-from trajectron_service import logs
+from trajectron_service import logs, passes
 from trajectron_service.access import scope_of_rpc
 from trajectron_service.admission import Admission
 from trajectron_service.errors import ErrorKind, ServiceError
@@ -105,7 +105,8 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
                     self._admit(method, context)
                     # Closed here, not by the garbage collector: a cancelled stream frees its
                     # session at once.
-                    async with aclosing(behaviour(checked(request), context)) as answers:
+                    behaved = behaviour(checked(request), context)
+                    async with aclosing(passes.while_good(behaved)) as answers:
                         async for answer in answers:
                             yield answer
                 except Exception as error:  # noqa: BLE001  every fault becomes a status

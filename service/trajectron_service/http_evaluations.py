@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from trajectron_proto.v1 import evaluation_pb2 as pb
+from trajectron_service import passes
 from trajectron_service.errors import ServiceError
 from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.evaluations.messages import EvaluationInfo, ResultFormat
@@ -115,9 +116,9 @@ class HttpEvaluations:
 
         Each event `evaluation` holds the evaluation as JSON; the stream ends after the one that
         shows its end. An event `problem` says why it ends before: the evaluation was deleted,
-        or the service is stopping.
+        the token has expired or was withdrawn, or the service is stopping.
         """
-        infos = self._evaluations.watch(evaluation_id)
+        infos = passes.while_good(self._evaluations.watch(evaluation_id))
         first = await anext(infos)
         return EventSourceResponse(_events(first, infos), headers=_EVENTS_HEADERS)
 

@@ -78,6 +78,8 @@ def serve(settings: Settings) -> None:
 async def _serve(settings: Settings) -> None:
     with _stop_signals() as stop:
         async with running(settings) as service:
+            loop = asyncio.get_running_loop()
+            loop.add_signal_handler(signal.SIGHUP, service.admission.reload)
             log.info(
                 "ready",
                 host=settings.host,
@@ -88,8 +90,6 @@ async def _serve(settings: Settings) -> None:
                 models=[model.name for model in service.application.list_models()],
                 kernels=next(model.kernels for model in service.application.list_models()),
             )
-            loop = asyncio.get_running_loop()
-            loop.add_signal_handler(signal.SIGHUP, service.admission.reload)
             await stop.wait()
             log.info("draining", grace_s=settings.drain_grace_s)
         log.info("stopped")
@@ -156,6 +156,8 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
         await pages.start()
         stack.push_async_callback(pages.stop)
         stack.push_async_callback(_drain, application, evaluations, health, settings.drain_grace_s)
+        watch = asyncio.create_task(admission.keep_watch(), name="tokens")
+        stack.callback(watch.cancel)
         await application.start()
         await evaluations.start()
         await health.ready()

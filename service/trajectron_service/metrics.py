@@ -197,6 +197,12 @@ class Metrics:
             ("kind",),
             registry=registry,
         )
+        self.tokens = Gauge("trajectron_tokens", "Tokens in force.", registry=registry)
+        self.tokens_stale = Gauge(
+            "trajectron_tokens_stale",
+            "1 while the file of tokens cannot be used, so that those it held before count.",
+            registry=registry,
+        )
         self.inference_seconds = Counter(
             "trajectron_inference_seconds",
             "Time that batches took on the inference thread, watching left out.",

@@ -37,8 +37,6 @@ _PREFIX = "trj_"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _TENANT = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _FIELDS = frozenset({"tenant", "scopes", "sha256", "expires", "requests_per_s"})
-# How often a changed file is looked for.
-_LOOK_S = 1.0
 
 log = logs.get(__name__)
 
@@ -77,7 +75,7 @@ def entry(token: str, tenant: str, scopes: list[Scope]) -> str:
 
 
 def read(path: Path) -> tuple[Token, ...]:
-    """The tokens of a file.
+    """The tokens of a file, which may have none.
 
     Raises:
         SettingsError: it cannot be read or understood; the message names the entry.
@@ -87,8 +85,8 @@ def read(path: Path) -> tuple[Token, ...]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SettingsError(f"tokens: cannot read {path}: {error}") from error
     entries = table.pop("token", [])
-    if table or not isinstance(entries, list) or not entries:
-        raise SettingsError(f"tokens: {path}: must hold [[token]] entries, one at least, only")
+    if table or not isinstance(entries, list):
+        raise SettingsError(f"tokens: {path}: may hold [[token]] entries only")
     tokens = tuple(
         _parsed(fields, f"{path}, token {place}") for place, fields in enumerate(entries, 1)
     )
@@ -98,9 +96,10 @@ def read(path: Path) -> tuple[Token, ...]:
 
 
 class Tokens:
-    """The tokens in force: those of the file as it is now, looked at once a second at most.
+    """The tokens in force: those of the file as it is now.
 
-    A changed file that cannot be used leaves the tokens as they were, with a line in the log.
+    An emptied file means that nobody may call. One that cannot be used, or is gone, leaves the
+    tokens as they were: ``stale``, with an error in the log.
 
     Args:
         path: the file.
@@ -108,25 +107,35 @@ class Tokens:
 
     Raises:
         SettingsError: as ``read``.
+
+    Attributes:
+        stale: whether the file cannot be used, so that what it held before counts.
     """
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.time) -> None:
         self._path = path
         self._clock = clock
-        self._stamp = _stamp(path)
+        self._stamp = self._seen = _stamp(path)
         self._tokens = read(path)
-        self._look_at = time.monotonic() + _LOOK_S
+        self.stale = False
+        self._tell()
+
+    def __len__(self) -> int:
+        return len(self._tokens)
 
     def find(self, presented: str) -> Token | None:
         """The token presented, None when it is unknown or has expired.
 
         All entries are compared, each in constant time: how long it takes tells nothing.
         """
-        if time.monotonic() >= self._look_at:
-            self._look_at = time.monotonic() + _LOOK_S
-            if _stamp(self._path) != self._stamp:
-                self.reload()
-        sha256 = digest(presented)
+        return self._find(digest(presented))
+
+    def again(self, token: Token) -> Token | None:
+        """A token found before as it is now; None when it is gone, has expired, or is another's."""
+        found = self._find(token.sha256)
+        return found if found and found.tenant == token.tenant else None
+
+    def _find(self, sha256: str) -> Token | None:
         found = None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, sha256):
@@ -135,15 +144,35 @@ class Tokens:
             return None
         return found
 
+    def look(self) -> None:
+        """Reads the file again once it has changed and stays so from one look to the next.
+
+        A file that is just being written may be empty, or lack its end.
+        """
+        stamp = _stamp(self._path)
+        if stamp != self._stamp and stamp == self._seen:
+            self.reload()
+        self._seen = stamp
+
     def reload(self) -> None:
-        """Reads the file again."""
+        """Reads the file again, now."""
         self._stamp = _stamp(self._path)
         try:
             self._tokens = read(self._path)
         except SettingsError as error:
-            log.warning("tokens not read again, the old ones hold", reason=str(error))
+            self.stale, reason = True, str(error)
         else:
+            self.stale, reason = False, ""
+        if self.stale:
+            log.error("the file of tokens cannot be used, those before hold", reason=reason)
+        else:
+            self._tell()
+
+    def _tell(self) -> None:
+        if self._tokens:
             log.info("tokens read", count=len(self._tokens))
+        else:
+            log.warning("the file of tokens has none: nobody may call", path=str(self._path))
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

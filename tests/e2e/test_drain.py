@@ -31,6 +31,8 @@ from tests.contract.servers import save_small_model
 from tests.process import environment
 
 from trajectron_proto.v1 import trajectron_pb2 as pb
+from trajectron_service.tenancy import Scope
+from trajectron_service.tokens import entry, new_token
 
 pytestmark = [pytest.mark.asyncio(loop_scope="session"), pytest.mark.timeout(400)]
 
@@ -174,6 +176,31 @@ async def until(http: httpx.AsyncClient, sample: str) -> None:
     async with asyncio.timeout(PATIENCE_S):
         while sample not in (await http.get("/metrics")).text.splitlines():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
+
+
+async def test_sighup_withdraws_the_tokens_that_are_not_in_the_file_any_more(
+    model: Path, tmp_path: Path
+) -> None:
+    file, token = tmp_path / "tokens.toml", new_token()
+    file.write_text(entry(token, "fleet", [Scope.SESSIONS]))
+    async with (
+        service(model, tokens=str(file), warm_up="0") as run,
+        clients(run) as (http, channel),
+    ):
+        call: Any = GrpcDriver(channel).stub.StreamPredict(
+            metadata=[("authorization", f"Bearer {token}")]
+        )
+        await call.write(pb.StreamPredictRequest(open=pb.StreamOpen()))
+        assert (await call.read()).opened.session.id
+        file.write_text("")
+        run.process.send_signal(signal.SIGHUP)
+        async with asyncio.timeout(PATIENCE_S):
+            assert await call.code() is grpc.StatusCode.UNAUTHENTICATED
+        answer = await http.get("/v1/sessions", headers={"Authorization": f"Bearer {token}"})
+        assert answer.status_code == 401
+        run.process.send_signal(signal.SIGTERM)
+        assert await ended(run) == 0
+        assert "nobody may call" in "".join(run.log)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -68,23 +68,74 @@ def test_an_expired_token_is_not_found(file: Path) -> None:
     assert Tokens(file, clock=lambda: 1893456000.0).find(FLEET) is None
 
 
-def test_a_changed_file_counts_and_a_broken_one_leaves_things_as_they_were(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tokens, "_LOOK_S", 0.0)
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """What the log of tokens is told: levels and events."""
+    lines: list[tuple[str, str]] = []
+    for level in ("info", "warning", "error"):
+
+        def say(event: str, *, level: str = level, **_: object) -> None:
+            lines.append((level, event))
+
+        monkeypatch.setattr(tokens.log, level, say, raising=False)
+    return lines
+
+
+def looked(known: Tokens, times: int = 2) -> Tokens:
+    for _ in range(times):
+        known.look()
+    return known
+
+
+def test_a_changed_file_counts_once_it_stays_as_it_is(file: Path) -> None:
     known, other = Tokens(file), new_token()
+    file.write_text("")  # an editor may empty a file before it writes it
+    assert looked(known, 1).find(FLEET) is not None
     file.write_text(entry(other, "other", [Scope.ADMIN]))
-    assert known.find(FLEET) is None
+    assert looked(known, 1).find(FLEET) is not None
+    assert looked(known, 1).find(FLEET) is None
     assert known.find(other) is not None
-    file.write_text("[[token]")
-    assert known.find(other) is not None
+
+
+@pytest.mark.parametrize("text", ["[[token]", "x = 1", None])
+def test_a_file_that_cannot_be_used_leaves_things_as_they_were_and_says_so(
+    file: Path, text: str | None, said: list[tuple[str, str]]
+) -> None:
+    known, metrics, before = Tokens(file), Metrics(), file.read_text()
+    admission = Admission(known, metrics)
+    if text is None:
+        file.unlink()
+    else:
+        file.write_text(text)
+    looked(known)
+    assert known.find(FLEET) is not None
+    assert b"trajectron_tokens_stale 1.0" in metrics.render()
+    assert [level for level, event in said if "cannot be used" in event] == ["error"]
+    file.write_text(before + "# mended\n")
+    admission.reload()
+    assert b"trajectron_tokens_stale 0.0" in metrics.render()
+
+
+@pytest.mark.parametrize("text", ["", "# nobody any more\n", "token = []\n"])
+def test_an_emptied_file_lets_nobody_in(file: Path, text: str, said: list[tuple[str, str]]) -> None:
+    metrics = Metrics()
+    admission = Admission(Tokens(file), metrics)
+    assert b"trajectron_tokens 1.0" in metrics.render()
+    file.write_text(text)
+    admission.reload()
+    for given in (None, f"Bearer {FLEET}"):
+        assert refusal(admission, given, Scope.PREDICT) is ErrorKind.UNAUTHENTICATED
+    assert b"trajectron_tokens 0.0" in metrics.render()
+    assert [level for level, event in said if "nobody may call" in event] == ["warning"]
+    assert refusal(Admission(Tokens(file), Metrics()), None, Scope.PREDICT) is (
+        ErrorKind.UNAUTHENTICATED
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "one at least"),
-        ("x = 1", "one at least"),
+        ("x = 1", "entries only"),
         ("[[token]", "cannot read"),
         ('[[token]]\ntenant = "a"\nscope = ["predict"]', "may have"),
         ('[[token]]\ntenant = "../a"\nscopes = ["predict"]', "tenant must be"),
