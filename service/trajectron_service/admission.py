@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import time
 import weakref
-from collections.abc import Callable
 
 from trajectron_service import logs, passes, tenancy
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.metrics import Metrics
 from trajectron_service.passes import Pass
+from trajectron_service.quotas import Rate, Usage
 from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import Token, Tokens
 
 _SCHEME = "bearer"
 # How often the file is looked at, and passes are checked.
 LOOK_S = 1.0
-# A tenant may save up a second's worth of requests, one at least.
-_BURST_S = 1.0
 
 log = logs.get(__name__)
 
@@ -29,19 +26,18 @@ class Admission:
     Args:
         tokens: None lets everybody in, as the one default tenant.
         metrics: told of those refused.
-        clock: seconds that never go back.
+        usage: counts the calls of each tenant.
     """
 
     def __init__(
         self,
         tokens: Tokens | None,
         metrics: Metrics,
-        clock: Callable[[], float] = time.monotonic,
+        usage: Usage,
     ) -> None:
         self._tokens = tokens
         self._metrics = metrics
-        self._clock = clock
-        self._buckets: dict[str, _Bucket] = {}
+        self._usage = usage
         self._passes: weakref.WeakSet[Pass] = weakref.WeakSet()
         if tokens is not None:
             metrics.tokens.set_function(lambda: len(tokens))
@@ -64,11 +60,11 @@ class Admission:
             refusal = _beyond(token, scope)
             if refusal is not None:
                 raise refusal
-            self._count(token)
+            tenancy.enter(token.tenant)
+            self._usage.take(Rate.REQUESTS)
         except ServiceError as error:
             self._metrics.refusals.labels(error.kind.value).inc()
             raise
-        tenancy.enter(token.tenant)
         held = _pass(self._tokens, token, scope)
         self._passes.add(held)
         passes.enter(held)
@@ -109,20 +105,6 @@ class Admission:
             )
         return found
 
-    def _count(self, token: Token) -> None:
-        if token.requests_per_s is None:
-            return
-        bucket = self._buckets.get(token.sha256)
-        if bucket is None or bucket.rate != token.requests_per_s:
-            bucket = self._buckets[token.sha256] = _Bucket(token.requests_per_s, self._clock())
-        wait_s = bucket.take(self._clock())
-        if wait_s > 0.0:
-            raise ServiceError(
-                ErrorKind.RATE_LIMITED,
-                f"this token may make {token.requests_per_s:g} requests a second",
-                retry_after_s=wait_s,
-            )
-
 
 def _pass(tokens: Tokens, token: Token, scope: Scope) -> Pass:
     def fault() -> ServiceError | None:
@@ -144,22 +126,3 @@ def _beyond(token: Token, scope: Scope) -> ServiceError | None:
     return ServiceError(
         ErrorKind.PERMISSION_DENIED, f"this token has no scope {scope.value}, which the call needs"
     )
-
-
-class _Bucket:
-    """Fills at ``rate`` a second up to a burst; each call takes one out."""
-
-    def __init__(self, rate: float, now: float) -> None:
-        self.rate = rate
-        self._most = max(1.0, rate * _BURST_S)
-        self._level = self._most
-        self._filled_at = now
-
-    def take(self, now: float) -> float:
-        """0 where there was one to take, else the seconds until there will be."""
-        self._level = min(self._most, self._level + (now - self._filled_at) * self.rate)
-        self._filled_at = now
-        if self._level >= 1.0:
-            self._level -= 1.0
-            return 0.0
-        return (1.0 - self._level) / self.rate

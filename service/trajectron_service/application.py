@@ -9,7 +9,7 @@ import asyncio
 import time
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 
 from trajectron_service import choices as chosen
 from trajectron_service import logs, pages, tenancy
@@ -30,6 +30,7 @@ from trajectron_service.messages import (
     UnknownTypes,
 )
 from trajectron_service.metrics import Metrics
+from trajectron_service.quotas import Rate, Usage, unlimited
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import SceneEngine, SceneJob, SceneResult
 from trajectron_service.session_errors import STREAM_ENDED
@@ -67,6 +68,7 @@ class Application:
         metrics: told about everything.
         work: counts the calls, and refuses them while the service drains; its own when None.
         store: where sessions are kept; this process's memory when None.
+        usage: holds tenants to their quotas; nobody has one where None.
         clock: Unix seconds that never go back: when sessions expire.
         draw_seed: gives the seed of a request that brings none.
     """
@@ -79,6 +81,7 @@ class Application:
         *,
         work: WorkInHand | None = None,
         store: SessionStore | None = None,
+        usage: Usage | None = None,
         clock: Callable[[], float] | None = None,
         draw_seed: Callable[[], int] = chosen.draw_seed,
     ) -> None:
@@ -86,6 +89,7 @@ class Application:
         self._engine = engine
         self._metrics = metrics
         self._work = work or WorkInHand(metrics)
+        self._usage = usage or unlimited(metrics)
         self._clock = clock or steady_unix_clock()
         self._choices = Choices(settings, engine.models, engine.default_model, draw_seed)
         self._batcher = Batcher[SceneJob, SceneResult](
@@ -95,7 +99,7 @@ class Application:
             batch_s=_BATCH_S,
             report=self._note_batch,
         )
-        self._forecaster = Forecaster(self._choices, self._batcher, metrics)
+        self._forecaster = Forecaster(self._choices, self._batcher, metrics, self._usage)
         self._sessions = Sessions(
             store or MemoryStore(),
             self._forecaster.packed,
@@ -103,6 +107,7 @@ class Application:
             metrics=metrics,
             max_sessions=settings.max_sessions,
             park_after_s=settings.park_after_s,
+            usage=self._usage,
             on_close=self._on_close,
         )
         self._accuracy = self._watch() if settings.live_accuracy else None
@@ -194,9 +199,10 @@ class Application:
             requests = [FrameRequest(frame) for frame in frames[:-1]]
             requests.append(FrameRequest(frames[-1], options))
             async with self._until(deadline) as limit:
-                _, _, answers = await self._forecaster.fold(
-                    self._blank(asked), requests, deadline=limit, strict=True
-                )
+                with self._usage.taken(Rate.FRAMES, len(frames)):
+                    _, _, answers = await self._forecaster.fold(
+                        self._blank(asked), requests, deadline=limit, strict=True
+                    )
         forecast = answers[-1].forecast
         assert forecast is not None  # strict: else it has raised
         return forecast
@@ -243,9 +249,8 @@ class Application:
         with self._work.taken():
             self._check_frames(frames)
             async with self._until(deadline) as limit:
-                answers = await self._fold(
-                    _key(session_id), requests, limit, strict=len(frames) == 1
-                )
+                strict = len(frames) == 1
+                answers = await self._fold(_key(session_id), requests, limit, strict=strict)
         return tuple(answer.result for answer in answers)
 
     async def predict_session(
@@ -273,12 +278,18 @@ class Application:
     async def open_stream(
         self, session_id: str | None, config: SessionConfig, options: StreamOptions
     ) -> Stream:
-        """A stream into a session, new or resumed; another stream into it ends."""
-        with self._work.taken():
+        """A stream into a session, new or resumed; another stream into it ends.
+
+        To be closed by the caller, whether its replies were read or not.
+        """
+        with self._work.taken(), ExitStack() as counted:
             if options.forecast is not None:
                 self._choices.check_options(options.forecast)
-            session, resumed = await self._open(session_id, config, must_exist=options.must_exist)
-            key = _key(session.id)
+            key = _key(chosen.session_id(session_id))
+            counted.enter_context(self._usage.stream(key.id))
+            session, resumed = await self._open(
+                key, config, named=bool(session_id), must_exist=options.must_exist
+            )
             before = self._streams.get(key)
             if before is not None:
                 await before.take_over()
@@ -290,6 +301,7 @@ class Application:
                 fold=lambda requests, deadline: self._fold(key, requests, deadline),
                 on_end=lambda: self._sessions.delete(key, STREAM_ENDED),
                 busy=lambda: self._streaming(key),
+                on_close=counted.pop_all().close,
                 limits=StreamLimits(
                     self._settings.stream_window,
                     self._settings.max_batch_points,
@@ -301,13 +313,12 @@ class Application:
             return stream
 
     async def _open(
-        self, session_id: str | None, config: SessionConfig, *, must_exist: bool
+        self, key: SessionKey, config: SessionConfig, *, named: bool, must_exist: bool
     ) -> tuple[SessionInfo, bool]:
-        """The session, and whether it was there already."""
-        key = _key(chosen.session_id(session_id))
+        """The session, and whether it was there already; one not ``named`` by its client is not."""
         if must_exist:
             return await self._sessions.info(key), True
-        if session_id:
+        if named:
             with _past(ErrorKind.UNKNOWN_SESSION):
                 return await self._sessions.info(key), True
         try:
@@ -341,7 +352,8 @@ class Application:
             )
             return Change(after, packed), (after, answers)
 
-        record, answers = await self._sessions.change(key, observe, extends=True)
+        with self._usage.taken(Rate.FRAMES, len(requests)):
+            record, answers = await self._sessions.change(key, observe, extends=True)
         self._note_answers(key, record, answers)
         return answers
 

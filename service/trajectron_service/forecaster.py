@@ -27,6 +27,7 @@ from trajectron_service.messages import (
 )
 from trajectron_service.metrics import Metrics
 from trajectron_service.pace import Work
+from trajectron_service.quotas import Rate, Usage
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
 from trajectron_service.timebase import Observation, Step, advance, classify, head
@@ -86,12 +87,16 @@ class _Fold:
     answers: list[FrameAnswer] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     tasks: dict[int, ForecastTask] = field(default_factory=dict)  # by the index of the frame
+    points: int = 0  # of the tasks, taken from what the tenant may ask for
 
 
 class Forecaster:
     """Folds frames into records, through the batcher."""
 
-    def __init__(self, choices: Choices, batcher: SceneBatcher, metrics: Metrics) -> None:
+    def __init__(
+        self, choices: Choices, batcher: SceneBatcher, metrics: Metrics, usage: Usage
+    ) -> None:
+        self._usage = usage
         self._choices = choices
         self._batcher = batcher
         self._metrics = metrics
@@ -115,12 +120,16 @@ class Forecaster:
             ServiceError: the work could not be done; none of the frames counts.
         """
         folded = await self._fold(record, requests)
-        if strict:
-            _raise_first(folded.answers)
         result = None
-        if folded.steps or folded.tasks:
-            job = self._job(record, folded, pack)
-            result = await self._run(job, key, deadline)
+        try:
+            if strict:
+                _raise_first(folded.answers)
+            if folded.steps or folded.tasks:
+                job = self._job(record, folded, pack)
+                result = await self._run(job, key, deadline)
+        except ServiceError:
+            self._usage.give_back(Rate.POINTS, folded.points)
+            raise
         after, packed = _with_states(folded.record, record, result)
         answers = folded.answers
         for number, (index, task) in enumerate(folded.tasks.items()):
@@ -145,7 +154,8 @@ class Forecaster:
         model = self._model(record)
         task = self._choices.task(options, record.timeline, record.version, model)
         job = dataclasses.replace(_idle_job(record), forecasts=(task,))
-        result = await self._run(job, key, deadline)
+        with self._usage.taken(Rate.POINTS, task_points(task, model)):
+            result = await self._run(job, key, deadline)
         after, _ = _with_states(record, record, result)
         return after, self._forecast(record, task, result.forecasts[0])
 
@@ -201,9 +211,11 @@ class Forecaster:
         wanted = request.options is not None and not answer.stale and not answer.result.refused
         if wanted and request.options is not None:
             try:
-                fold.tasks[len(fold.answers)] = self._choices.task(
-                    request.options, record.timeline, record.version, model
-                )
+                task = self._choices.task(request.options, record.timeline, record.version, model)
+                points = task_points(task, model)
+                self._usage.take(Rate.POINTS, points)
+                fold.points += points
+                fold.tasks[len(fold.answers)] = task
             except ServiceError as error:
                 answer = dataclasses.replace(answer, error=error)
         fold.answers.append(answer)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator
-from contextlib import aclosing
+from contextlib import aclosing, closing
 from typing import Any, cast
 
 import grpc
@@ -116,14 +116,15 @@ class GrpcApi(trajectron_pb2_grpc.TrajectronServiceServicer):
             convert.session_config(first.open.config),
             convert.stream_options(first.open),
         )
-        yield pb.StreamPredictResponse(
-            opened=pb.StreamOpened(
-                session=convert.session_message(stream.session), resumed=stream.resumed
+        with closing(stream):
+            yield pb.StreamPredictResponse(
+                opened=pb.StreamOpened(
+                    session=convert.session_message(stream.session), resumed=stream.resumed
+                )
             )
-        )
-        async with aclosing(stream.replies(_frames(requests))) as replies:
-            async for reply in replies:
-                yield pb.StreamPredictResponse(reply=_reply_message(reply))
+            async with aclosing(stream.replies(_frames(requests))) as replies:
+                async for reply in replies:
+                    yield pb.StreamPredictResponse(reply=_reply_message(reply))
 
     async def ListModels(  # noqa: N802
         self, _request: pb.ListModelsRequest, _context: Context

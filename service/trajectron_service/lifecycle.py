@@ -26,6 +26,7 @@ from trajectron_service.http_routes import http_app
 from trajectron_service.http_server import HttpServer, listen
 from trajectron_service.metrics import Metrics
 from trajectron_service.protection import check_exposure, load_tls
+from trajectron_service.quotas import Usage, unlimited
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.stores import SessionStore
 from trajectron_service.stores.opening import open_store
@@ -112,7 +113,8 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
     tls = load_tls(settings)
     tokens = None if settings.tokens is None else Tokens(settings.tokens)
     metrics = Metrics(tracing or _tracing(settings))
-    admission = Admission(tokens, metrics)
+    usage = unlimited(metrics) if tokens is None else Usage(tokens.quotas, metrics)
+    admission = Admission(tokens, metrics, usage)
     metrics.build(version())
     health = Health(*SERVICES)
     await health.starting()
@@ -124,9 +126,9 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
         work = WorkInHand(metrics)
         store = await open_store(settings, metrics)
         stack.push_async_callback(store.close)
-        application = Application(settings, loaded, metrics, work=work, store=store)
+        application = Application(settings, loaded, metrics, work=work, store=store, usage=usage)
         stack.push_async_callback(_close, application)
-        evaluations = Evaluations(settings, metrics, work)
+        evaluations = Evaluations(settings, metrics, work, usage=usage)
         stack.push_async_callback(evaluations.close)
         calls = grpc_server(application, evaluations, health, metrics, admission, settings)
         with _port("grpc_port", settings.host, settings.grpc_port):

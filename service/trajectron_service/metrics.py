@@ -1,4 +1,8 @@
-"""Every metric of the service, on a registry of its own. No ids in labels."""
+"""Every metric of the service, on a registry of its own.
+
+No ids in labels, but names of tenants where one meets its quota: those are the operator's, and
+bounded.
+"""
 
 from __future__ import annotations
 
@@ -195,6 +199,13 @@ class Metrics:
             "trajectron_refusals",
             "Work refused or dropped, by the kind of error.",
             ("kind",),
+            registry=registry,
+        )
+        self.quota_refusals = Counter(
+            "trajectron_quota_refusals",
+            "Calls, frames and forecasts beyond a tenant's quota: refused, or, frames of streams, "
+            "made to wait. After a hundred tenants the others count as one.",
+            ("tenant", "quota"),
             registry=registry,
         )
         self.tokens = Gauge("trajectron_tokens", "Tokens in force.", registry=registry)

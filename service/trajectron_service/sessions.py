@@ -35,6 +35,7 @@ from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.kept_records import KeptRecords
 from trajectron_service.messages import SessionInfo
 from trajectron_service.metrics import Metrics
+from trajectron_service.quotas import Limit, Usage
 from trajectron_service.records import SceneRecord
 from trajectron_service.session_errors import DELETED, store_faults
 from trajectron_service.stores import (
@@ -94,6 +95,7 @@ class Sessions:
         metrics: told about sessions, agents and edges.
         max_sessions: more are refused.
         park_after_s: unused for longer, a session is kept as bytes only.
+        usage: how many a tenant may have.
         on_close: told which session has been closed for good.
     """
 
@@ -106,6 +108,7 @@ class Sessions:
         metrics: Metrics,
         max_sessions: int,
         park_after_s: float,
+        usage: Usage,
         on_close: Callable[[SessionKey], None] = lambda _: None,
     ) -> None:
         self._store = store
@@ -113,7 +116,8 @@ class Sessions:
         self._clock = clock
         self._metrics = metrics
         self._kept = KeptRecords(store, clock, metrics)
-        self._quota = Quota(max_sessions)
+        self._max_sessions = max_sessions
+        self._usage = usage
         self._park_after_s = park_after_s
         self._on_close = on_close
         self._live: dict[SessionKey, _Live] = {}
@@ -144,10 +148,12 @@ class Sessions:
                 raise ServiceError(
                     ErrorKind.SESSION_EXISTS, f"session_id: {quoted(key.id)} is open already"
                 )
+            if made is Creation.TENANT_FULL:
+                raise self._usage.too_many(Limit.SESSIONS)
             if made is not Creation.CREATED:
                 raise ServiceError(
                     ErrorKind.TOO_MANY_SESSIONS,
-                    f"{self._quota.total} sessions are open, as many as this server takes; "
+                    f"{self._max_sessions} sessions are open, as many as this server takes; "
                     "close one or try again later",
                     retry_after_s=_RETRY_AFTER_FULL_S,
                 )
@@ -312,12 +318,13 @@ class Sessions:
 
     async def _create(self, live: _Live, stored: StoredSession) -> Creation:
         """Adds a session to the store, and makes it the live one where that went well."""
+        quota = Quota(self._max_sessions, self._usage.limit(Limit.SESSIONS))
         async with self._lock(live.key):
-            made = await self._store.create(live.key, stored, self._quota)
+            made = await self._store.create(live.key, stored, quota)
             if made is Creation.TAKEN:
                 idle = self._kept.idle()
                 if await self._remove(live.key, idle, expired_by=idle.at):
-                    made = await self._store.create(live.key, stored, self._quota)
+                    made = await self._store.create(live.key, stored, quota)
             if made is Creation.CREATED:
                 live.revision, live.stored_expiry = stored.revision, stored.expires_at
                 old = self._live.get(live.key)

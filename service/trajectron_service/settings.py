@@ -199,10 +199,11 @@ def load(**flags: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in flags.items() if value is not None})
     except ValidationError as error:
-        raise SettingsError("; ".join(map(_explain, error.errors()))) from error
+        raise SettingsError("; ".join(map(explained, error.errors()))) from error
 
 
-def _explain(fault: Any) -> str:
+def explained(fault: Any) -> str:
+    """A fault that pydantic found, in the words of our messages."""
     name = ".".join(map(str, fault["loc"]))
     if fault["type"] == "extra_forbidden":
         return f"{name}: unknown setting"

@@ -48,6 +48,8 @@ _ENDS_STREAM = frozenset(
         ErrorKind.STORE_UNAVAILABLE,
     }
 )
+# What time heals: frames wait for it as long as they may take.
+_PASSES = frozenset({ErrorKind.OVERLOADED, ErrorKind.RATE_LIMITED})
 
 # Folds frames into the stream's session: the answers, in order.
 Fold = Callable[[Sequence[FrameRequest], float | None], Awaitable[list[FrameAnswer]]]
@@ -137,6 +139,7 @@ class Stream:
         fold: Fold,
         on_end: Callable[[], Awaitable[None]],
         busy: Callable[[], AbstractContextManager[None]],
+        on_close: Callable[[], None],
         limits: StreamLimits,
         metrics: Metrics,
     ) -> None:
@@ -146,6 +149,7 @@ class Stream:
         self._fold = fold
         self._on_end = on_end
         self._busy = busy
+        self._on_close = on_close
         self._limits = limits
         self._metrics = metrics
         latest = options.delivery is Delivery.LATEST
@@ -186,6 +190,10 @@ class Stream:
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def close(self) -> None:
+        """Says that nobody uses the stream any more, whether its replies were ever read or not."""
+        self._on_close()
 
     def drain(self) -> None:
         """Takes no more frames; those read are still answered, then the stream ends."""
@@ -285,14 +293,14 @@ class Stream:
     async def _fold_patiently(
         self, requests: Sequence[FrameRequest], deadline: float
     ) -> list[FrameAnswer]:
-        """Folds; a full queue makes the stream wait, which slows its client down."""
+        """Folds; a full queue or a used-up rate makes the stream wait: its client slows down."""
         while True:
             try:
                 return await self._fold(requests, deadline)
             except ServiceError as error:
                 pause_s = error.retry_after_s or 0.1
                 late = time.monotonic() + pause_s >= deadline
-                if error.kind is not ErrorKind.OVERLOADED or late:
+                if error.kind not in _PASSES or late:
                     raise
                 await asyncio.sleep(pause_s)
 

@@ -11,7 +11,12 @@ cannot be used to keep the service busy with wrong tokens.
     scopes = ["predict", "sessions"]
     sha256 = "..."
     expires = 2030-01-01T00:00:00Z   # optional
-    requests_per_s = 50              # optional
+
+    [quotas]                         # optional, of each tenant
+    sessions = 100
+
+    [tenants.fleet]                  # optional, before those of each tenant
+    requests_per_s = 50
 """
 
 from __future__ import annotations
@@ -22,34 +27,46 @@ import re
 import secrets
 import time
 import tomllib
-from collections.abc import Callable
+from collections import ChainMap
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from trajectron_service import logs
-from trajectron_service.settings import SettingsError
+from trajectron_service.quotas import Quotas
+from trajectron_service.settings import SettingsError, explained
 from trajectron_service.tenancy import Scope
 
 _TOKEN_BYTES = 32
 _PREFIX = "trj_"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _TENANT = re.compile(r"[A-Za-z0-9._-]{1,64}")
-_FIELDS = frozenset({"tenant", "scopes", "sha256", "expires", "requests_per_s"})
+_FIELDS = frozenset({"tenant", "scopes", "sha256", "expires"})
 
 log = logs.get(__name__)
 
 
 @dataclass(frozen=True)
 class Token:
-    """One entry of the file; ``expires_at`` in Unix seconds, ``requests_per_s`` None for any."""
+    """One entry of the file; ``expires_at`` in Unix seconds."""
 
     tenant: str
     scopes: frozenset[Scope]
     sha256: str
     expires_at: float | None = None
-    requests_per_s: float | None = None
+
+
+@dataclass(frozen=True)
+class TokensFile:
+    """What a file says: tokens, the quotas of tenants that it names, and those of all others."""
+
+    tokens: tuple[Token, ...]
+    tenants: Mapping[str, Quotas]
+    others: Quotas
 
 
 def new_token() -> str:
@@ -62,8 +79,8 @@ def digest(token: str) -> str:
     return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def entry(token: str, tenant: str, scopes: list[Scope]) -> str:
-    """The lines of a token for the file.
+def entry(token: str, tenant: str, scopes: list[Scope], expires: datetime | None = None) -> str:
+    """The lines of a token for the file; ``expires`` with its offset.
 
     Raises:
         SettingsError: no such name can be a tenant's, or there are no scopes.
@@ -71,11 +88,12 @@ def entry(token: str, tenant: str, scopes: list[Scope]) -> str:
     names = [scope.value for scope in scopes]
     _parsed({"tenant": tenant, "scopes": names, "sha256": digest(token)}, "the new token")
     listed = ", ".join(f'"{name}"' for name in names)
-    return f'[[token]]\ntenant = "{tenant}"\nscopes = [{listed}]\nsha256 = "{digest(token)}"\n'
+    lines = f'[[token]]\ntenant = "{tenant}"\nscopes = [{listed}]\nsha256 = "{digest(token)}"\n'
+    return lines if expires is None else f"{lines}expires = {expires.isoformat('T', 'seconds')}\n"
 
 
-def read(path: Path) -> tuple[Token, ...]:
-    """The tokens of a file, which may have none.
+def read(path: Path) -> TokensFile:
+    """A file of tokens, which may have none.
 
     Raises:
         SettingsError: it cannot be read or understood; the message names the entry.
@@ -84,15 +102,23 @@ def read(path: Path) -> tuple[Token, ...]:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SettingsError(f"tokens: cannot read {path}: {error}") from error
-    entries = table.pop("token", [])
-    if table or not isinstance(entries, list):
-        raise SettingsError(f"tokens: {path}: may hold [[token]] entries only")
+    entries, tenants = table.pop("token", []), table.pop("tenants", {})
+    general = table.pop("quotas", {})
+    kinds = isinstance(entries, list), isinstance(tenants, dict), isinstance(general, dict)
+    if table or not all(kinds):
+        raise SettingsError(
+            f"tokens: {path}: may hold [[token]] entries, [quotas] and [tenants.NAME] only"
+        )
     tokens = tuple(
         _parsed(fields, f"{path}, token {place}") for place, fields in enumerate(entries, 1)
     )
     if len({token.sha256 for token in tokens}) < len(tokens):
         raise SettingsError(f"tokens: {path}: the same sha256 stands there twice")
-    return tokens
+    return TokensFile(
+        tokens,
+        {name: _quotas(path, f"tenants.{name}", general, own) for name, own in tenants.items()},
+        _quotas(path, "quotas", general),
+    )
 
 
 class Tokens:
@@ -116,12 +142,16 @@ class Tokens:
         self._path = path
         self._clock = clock
         self._stamp = self._seen = _stamp(path)
-        self._tokens = read(path)
+        self._file = read(path)
         self.stale = False
         self._tell()
 
     def __len__(self) -> int:
-        return len(self._tokens)
+        return len(self._file.tokens)
+
+    def quotas(self, tenant: str) -> Quotas:
+        """What a tenant may use."""
+        return self._file.tenants.get(tenant, self._file.others)
 
     def find(self, presented: str) -> Token | None:
         """The token presented, None when it is unknown or has expired.
@@ -137,7 +167,7 @@ class Tokens:
 
     def _find(self, sha256: str) -> Token | None:
         found = None
-        for token in self._tokens:
+        for token in self._file.tokens:
             if hmac.compare_digest(token.sha256, sha256):
                 found = token
         if found and found.expires_at is not None and found.expires_at <= self._clock():
@@ -158,7 +188,7 @@ class Tokens:
         """Reads the file again, now."""
         self._stamp = _stamp(self._path)
         try:
-            self._tokens = read(self._path)
+            self._file = read(self._path)
         except SettingsError as error:
             self.stale, reason = True, str(error)
         else:
@@ -169,10 +199,13 @@ class Tokens:
             self._tell()
 
     def _tell(self) -> None:
-        if self._tokens:
-            log.info("tokens read", count=len(self._tokens))
+        if self._file.tokens:
+            log.info("tokens read", count=len(self))
         else:
             log.warning("the file of tokens has none: nobody may call", path=str(self._path))
+        idle = self._file.tenants.keys() - {token.tenant for token in self._file.tokens}
+        if idle:
+            log.warning("quotas of tenants without a token", tenants=sorted(idle))
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
@@ -193,19 +226,28 @@ def _parsed(fields: Any, where: str) -> Token:
         )
     if not isinstance(sha256, str) or not _SHA256.fullmatch(sha256):
         raise SettingsError(f"tokens: {where}: sha256 must be 64 digits of lower-case hexadecimal")
-    expires, rate = fields.get("expires"), fields.get("requests_per_s")
+    expires = fields.get("expires")
     if expires is not None and not (isinstance(expires, datetime) and expires.tzinfo):
         raise SettingsError(f"tokens: {where}: expires must be a date and time with its offset")
-    number = isinstance(rate, int | float) and not isinstance(rate, bool)
-    if rate is not None and not (number and 0.0 < rate <= 1e6):
-        raise SettingsError(f"tokens: {where}: requests_per_s must be above 0, at most 1000000")
     return Token(
         tenant,
         _scopes(fields.get("scopes"), where),
         sha256,
         None if expires is None else expires.timestamp(),
-        rate,
     )
+
+
+def _quotas(path: Path, table: str, *tables: Any) -> Quotas:
+    """Quotas of a table; later ones go before earlier ones."""
+    try:
+        return Quotas(**dict(ChainMap(*reversed(tables))))
+    except (TypeError, ValueError) as error:
+        reason = (
+            "; ".join(map(explained, error.errors()))
+            if isinstance(error, ValidationError)
+            else error
+        )
+        raise SettingsError(f"tokens: {path}: [{table}]: {reason}") from error
 
 
 def _scopes(names: Any, where: str) -> frozenset[Scope]:

@@ -67,6 +67,7 @@ EXPORTED = [
     "TooLargeError",
     "TooManyEvaluationsError",
     "TooManySessionsError",
+    "TooManyStreamsError",
     "TrajectronError",
     "TransportError",
     "UnauthenticatedError",

@@ -56,6 +56,11 @@ class Scripted:
         takes, answers, end = self.script.pop(0) if self.script else (10_000, 10_000, "")
         if end == "REFUSED":
             context.abort(grpc.StatusCode.UNAVAILABLE, "not today")
+        if end == "CROWDED":
+            full = ServiceError(ErrorKind.TOO_MANY_STREAMS, "full", retry_after_s=0.05)
+            details = status_message(full).SerializeToString()
+            context.set_trailing_metadata((("grpc-status-details-bin", details),))
+            context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "full")
         yield pb.StreamPredictResponse(
             opened=pb.StreamOpened(session=session, resumed=len(self.opened) > 1)
         )
@@ -107,8 +112,17 @@ BREAKS = [
     pytest.param([(3, 3, "")], id="after the replies"),
     pytest.param([(3, 1, "")], id="with replies lost"),
     pytest.param([(0, 0, ""), (1, 0, ""), (2, 1, ""), (2, 2, "")], id="again and again"),
+    pytest.param([(2, 1, ""), (0, 0, "CROWDED"), (0, 0, "CROWDED")], id="to a tenant's limit"),
     pytest.param([(2, 1, "DRAINING"), (0, 0, "REFUSED"), (0, 0, "REFUSED")], id="while it drains"),
 ]
+
+
+def test_a_tenants_limit_is_told_to_who_opens_its_first_stream() -> None:
+    with serving(Scripted([(0, 0, "CROWDED")])) as target, tc.Client(target) as client:
+        with pytest.raises(tc.TooManyStreamsError) as told:
+            client.stream(walking(2))
+        assert told.value.retry_after_s == 0.05
+        assert len(list(client.stream(walking(2), forecast_every_frame=False))) == 2
 
 
 @pytest.mark.parametrize("script", BREAKS)
@@ -118,7 +132,7 @@ def test_every_frame_counts_once_and_has_its_reply(script: list[tuple[int, int, 
         stream = client.stream(walking(8), forecast_every_frame=False)
         replies = list(stream)
     assert [reply.sequence for reply in replies] == service.taken == list(range(1, 9))
-    assert stream.reconnects == sum(end != "REFUSED" for _, _, end in script)
+    assert stream.reconnects == sum(end not in ("REFUSED", "CROWDED") for _, _, end in script)
     assert len({opening.session_id for opening in service.opened}) == 1
     assert [opening.must_exist for opening in service.opened] == [False] + [True] * len(script)
 
@@ -137,7 +151,7 @@ async def test_the_asyncio_stream_goes_on_as_well(script: list[tuple[int, int, s
             stream = client.stream(live(), forecast_every_frame=False)
             replies = [reply async for reply in stream]
     assert [reply.sequence for reply in replies] == service.taken == list(range(1, 9))
-    assert stream.reconnects == sum(end != "REFUSED" for _, _, end in script)
+    assert stream.reconnects == sum(end not in ("REFUSED", "CROWDED") for _, _, end in script)
 
 
 def test_a_frame_that_comes_while_nobody_is_connected_is_sent_when_somebody_is() -> None:

@@ -290,7 +290,7 @@ async def test_a_client_that_goes_away_leaves_no_files_behind(
         with pytest.raises(asyncio.CancelledError):
             await creating
         assert not folder.exists()
-        assert evaluations._entering == 0
+        assert evaluations._entering.total() == 0
 
 
 class Gate:

@@ -14,6 +14,7 @@ from trajectron_service import records
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.messages import SessionConfig
 from trajectron_service.metrics import Metrics
+from trajectron_service.quotas import unlimited
 from trajectron_service.records import SceneRecord
 from trajectron_service.scenes import State
 from trajectron_service.sessions import Change, Sessions
@@ -97,6 +98,7 @@ class House:
             metrics=self.metrics,
             max_sessions=max_sessions,
             park_after_s=PARK_S,
+            usage=unlimited(self.metrics),
         )
 
     async def observe(self, key: SessionKey = KEY, wait: asyncio.Event | None = None) -> int:

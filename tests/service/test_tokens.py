@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from trajectron_service.admission import Admission
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.metrics import Metrics
 from trajectron_service.protection import check_exposure, load_tls
+from trajectron_service.quotas import Quotas, Usage, unlimited
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import Tokens, digest, entry, new_token
@@ -32,6 +35,12 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "tokens.toml"
     path.write_text(entry(FLEET, "fleet", [Scope.PREDICT, Scope.SESSIONS]))
     return path
+
+
+def guarded(tokens: Tokens | None, metrics: Metrics | None = None) -> Admission:
+    """The gate of a service whose tenants have no quotas."""
+    metrics = metrics or Metrics()
+    return Admission(tokens, metrics, unlimited(metrics))
 
 
 def refusal(admission: Admission, authorization: str | None, scope: Scope) -> ErrorKind | None:
@@ -102,7 +111,7 @@ def test_a_file_that_cannot_be_used_leaves_things_as_they_were_and_says_so(
     file: Path, text: str | None, said: list[tuple[str, str]]
 ) -> None:
     known, metrics, before = Tokens(file), Metrics(), file.read_text()
-    admission = Admission(known, metrics)
+    admission = guarded(known, metrics)
     if text is None:
         file.unlink()
     else:
@@ -119,7 +128,7 @@ def test_a_file_that_cannot_be_used_leaves_things_as_they_were_and_says_so(
 @pytest.mark.parametrize("text", ["", "# nobody any more\n", "token = []\n"])
 def test_an_emptied_file_lets_nobody_in(file: Path, text: str, said: list[tuple[str, str]]) -> None:
     metrics = Metrics()
-    admission = Admission(Tokens(file), metrics)
+    admission = guarded(Tokens(file), metrics)
     assert b"trajectron_tokens 1.0" in metrics.render()
     file.write_text(text)
     admission.reload()
@@ -127,15 +136,19 @@ def test_an_emptied_file_lets_nobody_in(file: Path, text: str, said: list[tuple[
         assert refusal(admission, given, Scope.PREDICT) is ErrorKind.UNAUTHENTICATED
     assert b"trajectron_tokens 0.0" in metrics.render()
     assert [level for level, event in said if "nobody may call" in event] == ["warning"]
-    assert refusal(Admission(Tokens(file), Metrics()), None, Scope.PREDICT) is (
-        ErrorKind.UNAUTHENTICATED
-    )
+    assert refusal(guarded(Tokens(file)), None, Scope.PREDICT) is (ErrorKind.UNAUTHENTICATED)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("x = 1", "entries only"),
+        ("x = 1", "entries, "),
+        ("[quotas]\nsession = 1", r"\[quotas\]: session: unknown"),
+        ("[quotas]\nsessions = 0", r"\[quotas\]: sessions: .*greater than or equal to 1"),
+        ("[quotas]\nframes_per_s = inf", r"\[quotas\]: frames_per_s: "),
+        ("[quotas]\nsessions = true", r"\[quotas\]: sessions: "),
+        ("[tenants]\nfleet = 1", r"\[tenants.fleet\]: "),
+        ("[tenants.fleet]\nstreams = 1.5", r"\[tenants.fleet\]: streams: "),
         ("[[token]", "cannot read"),
         ('[[token]]\ntenant = "a"\nscope = ["predict"]', "may have"),
         ('[[token]]\ntenant = "../a"\nscopes = ["predict"]', "tenant must be"),
@@ -152,13 +165,13 @@ def test_a_wrong_file_is_told_what_is_wrong(tmp_path: Path, text: str, message: 
 
 
 def test_without_tokens_everybody_comes_in_as_the_default_tenant() -> None:
-    Admission(None, Metrics()).admit(None, Scope.ADMIN)
+    guarded(None).admit(None, Scope.ADMIN)
     assert tenancy.current() == tenancy.DEFAULT
 
 
 def test_who_has_no_token_and_who_has_too_small_a_one_is_refused(file: Path) -> None:
     metrics = Metrics()
-    admission = Admission(Tokens(file), metrics)
+    admission = guarded(Tokens(file), metrics)
     for wrong in (None, "", "Bearer", "Bearer x", FLEET, f"Basic {FLEET}"):
         assert refusal(admission, wrong, Scope.PREDICT) is ErrorKind.UNAUTHENTICATED
     assert refusal(admission, f"Bearer {FLEET}", Scope.ADMIN) is ErrorKind.PERMISSION_DENIED
@@ -167,9 +180,9 @@ def test_who_has_no_token_and_who_has_too_small_a_one_is_refused(file: Path) -> 
 
 
 def test_more_requests_than_the_rate_are_refused_until_time_has_passed(file: Path) -> None:
-    file.write_text(file.read_text() + "requests_per_s = 2\n")
-    now = 0.0
-    admission = Admission(Tokens(file), Metrics(), clock=lambda: now)
+    file.write_text(file.read_text() + "[tenants.fleet]\nrequests_per_s = 2\n")
+    now, known, metrics = 0.0, Tokens(file), Metrics()
+    admission = Admission(known, metrics, Usage(known.quotas, metrics, lambda: now))
     answers = [refusal(admission, f"Bearer {FLEET}", Scope.PREDICT) for _ in range(3)]
     assert answers == [None, None, ErrorKind.RATE_LIMITED]
     with pytest.raises(ServiceError) as told:
@@ -204,3 +217,29 @@ def test_files_that_are_no_certificate_are_told(file: Path) -> None:
     with pytest.raises(SettingsError, match=r"cannot read .*nowhere"):
         load_tls(Settings(tls_certificate=file, tls_key=file.parent / "nowhere"))
     assert load_tls(Settings()) is None
+
+
+def test_a_token_may_be_made_to_expire(file: Path) -> None:
+    soon = new_token()
+    at = datetime(2030, 1, 1, 12, tzinfo=UTC)
+    file.write_text(file.read_text() + entry(soon, "fleet", [Scope.ADMIN], at))
+    assert Tokens(file, clock=lambda: at.timestamp() - 1.0).find(soon) is not None
+    assert Tokens(file, clock=at.timestamp).find(soon) is None
+    assert Tokens(file, clock=at.timestamp).find(FLEET) is not None
+
+
+def test_the_quotas_of_the_docs_mean_what_they_say(file: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    file.write_text(file.read_text() + example)
+    known = Tokens(file)
+    assert known.quotas("fleet") == Quotas(sessions=2000, frames_per_s=5000, requests_per_s=50)
+    assert known.quotas("another") == Quotas(sessions=100, requests_per_s=50)
+    for name in Quotas.model_fields:
+        assert f"`{name}`" in page
+
+
+def test_quotas_of_nobody_are_told(file: Path, said: list[tuple[str, str]]) -> None:
+    file.write_text(file.read_text() + "[tenants.flet]\nsessions = 1\n")
+    Tokens(file)
+    assert ("warning", "quotas of tenants without a token") in said

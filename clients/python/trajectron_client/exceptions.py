@@ -21,9 +21,10 @@ TrajectronError
     │   └── DatasetUnavailableError
     ├── ResourceExhaustedError
     │   ├── TooManySessionsError
+    │   ├── TooManyStreamsError     ``retry_after_s``
     │   ├── TooManyEvaluationsError
     │   ├── TooLargeError
-    │   ├── RateLimitedError        the token's calls a second are used up; ``retry_after_s``
+    │   ├── RateLimitedError        the tenant's calls, frames or points a second; ``retry_after_s``
     │   └── OverloadedError         the queue is full; see ``retry_after_s``
     ├── UnauthenticatedError        a valid token is required
     ├── PermissionDeniedError       the token lacks the scope that the call needs
@@ -150,11 +151,15 @@ class ResourceExhaustedError(ServiceError):
 
 
 class TooManySessionsError(ResourceExhaustedError):
-    """The server holds as many sessions as it may."""
+    """The server, or the tenant, holds as many sessions as it may."""
+
+
+class TooManyStreamsError(ResourceExhaustedError):
+    """The tenant has as many streams open as it may."""
 
 
 class TooManyEvaluationsError(ResourceExhaustedError):
-    """The server keeps as many evaluations as it may; delete some."""
+    """The server, or the tenant, keeps as many evaluations as it may; delete some."""
 
 
 class TooLargeError(ResourceExhaustedError):
@@ -166,7 +171,10 @@ class OverloadedError(ResourceExhaustedError):
 
 
 class RateLimitedError(ResourceExhaustedError):
-    """The token's calls a second are used up; ``retry_after_s`` says when there is another."""
+    """What the tenant may ask for a second is used up; ``retry_after_s`` says when to go on.
+
+    Of calls, frames or points of forecasts: the message says which.
+    """
 
 
 class UnauthenticatedError(ServiceError):
@@ -218,6 +226,7 @@ BY_REASON: dict[str, type[ServiceError]] = {
     "DATASET_UNAVAILABLE": DatasetUnavailableError,
     "TOO_MANY_EVALUATIONS": TooManyEvaluationsError,
     "TOO_MANY_SESSIONS": TooManySessionsError,
+    "TOO_MANY_STREAMS": TooManyStreamsError,
     "TOO_LARGE": TooLargeError,
     "RATE_LIMITED": RateLimitedError,
     "UNAUTHENTICATED": UnauthenticatedError,

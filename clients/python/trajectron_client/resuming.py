@@ -17,6 +17,7 @@ import grpc
 from trajectron_client import protobuf
 from trajectron_client.exceptions import (
     DrainingError,
+    ResourceExhaustedError,
     SessionLostError,
     StoreUnavailableError,
     TrajectronError,
@@ -86,6 +87,8 @@ def broken(error: grpc.RpcError) -> TrajectronError:
     told = from_rpc_error(error)
     if isinstance(told, (DrainingError, StoreUnavailableError)):
         return told
+    if isinstance(told, ResourceExhaustedError) and told.retry_after_s is not None:
+        return told  # of a stream that is opened: quotas of the tenant, for the moment
     if type(told) is TransportError and error.code().name in _BROKEN:
         return told
     raise told from error

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
 from trajectron_service import pages, tenancy
@@ -33,6 +34,7 @@ from trajectron_service.evaluations.requests import (
 from trajectron_service.evaluations.running import check_recordings
 from trajectron_service.evaluations.store import StoredEvaluation, StoreError
 from trajectron_service.metrics import Metrics
+from trajectron_service.quotas import Limit, Usage, unlimited
 from trajectron_service.settings import Settings, SettingsError
 from trajectron_service.validation import quoted, text_fault
 from trajectron_service.work import WorkInHand, stopping
@@ -48,6 +50,7 @@ class Evaluations:
         settings: limits and defaults; the archive's folder.
         metrics: told about everything.
         work: counts the calls, and refuses them while the service drains.
+        usage: how many a tenant may have; as many as there are where None.
         clock: Unix seconds.
 
     Raises:
@@ -61,9 +64,11 @@ class Evaluations:
         metrics: Metrics,
         work: WorkInHand,
         *,
+        usage: Usage | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._settings = settings
+        self._usage = usage or unlimited(metrics)
         self._work = work
         self._clock = clock
         self._choices = EvaluationChoices(settings, served_files(settings))
@@ -84,7 +89,7 @@ class Evaluations:
         self._entrance = asyncio.Lock()
         # Before the start nobody knows which ids and numbers are taken.
         self._started = asyncio.Event()
-        self._entering = 0
+        self._entering: Counter[str] = Counter()  # by tenant
 
     async def start(self) -> None:
         """Takes up what was queued or running when the service ended.
@@ -144,7 +149,7 @@ class Evaluations:
             if before is not None:
                 return before
             self._check_room()
-            self._entering += 1
+            self._entering[tenancy.current()] += 1
             try:
                 await self._started.wait()
                 async with self._entrance:
@@ -155,7 +160,7 @@ class Evaluations:
                     "the recordings could not be read in time; send fewer at a time",
                 ) from None
             finally:
-                self._entering -= 1
+                self._entering[tenancy.current()] -= 1
 
     async def _enter(
         self, info: EvaluationInfo, files: Sequence[RecordingFile], request_id: str, sha256: str
@@ -279,14 +284,18 @@ class Evaluations:
         return None
 
     def _check_room(self) -> None:
-        waiting = self._entering + self._queue.waiting
+        own, entering = list(self._own()), self._entering[tenancy.current()]
+        active = sum(not job.state.ended for job in own)
+        self._usage.check(Limit.EVALUATIONS_ACTIVE, active + entering)
+        self._usage.check(Limit.EVALUATIONS, len(own) + entering)
+        waiting = self._entering.total() + self._queue.waiting
         if waiting >= self._settings.evaluation_queue_size:
             raise ServiceError(
                 ErrorKind.OVERLOADED,
                 "as many evaluations wait as this server takes; try again later",
                 retry_after_s=_RETRY_AFTER_S,
             )
-        if len(self._queue) + self._entering >= self._settings.max_evaluations:
+        if len(self._queue) + self._entering.total() >= self._settings.max_evaluations:
             raise ServiceError(
                 ErrorKind.TOO_MANY_EVALUATIONS,
                 f"{self._settings.max_evaluations} evaluations are kept already; delete some",
