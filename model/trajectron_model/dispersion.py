@@ -18,10 +18,10 @@ from torch import Tensor
 from trajectron_model.config import Dispersion
 
 _LARGEST_CONTRAST = 20.0
-"""A mode is made at most so many times wider or narrower than its agent's modes are."""
+"""A mode is made at most so many times wider or narrower than its agent's modes are; as placing.c."""
 
 
-def disperse(covariance: Tensor, log_prior: Tensor, dispersion: Sequence[Dispersion]) -> Tensor:
+def disperse(covariance: Tensor, probability: Tensor, dispersion: Sequence[Dispersion]) -> Tensor:
     """Covariances of the modes, each step's scaled as its `Dispersion` says.
 
     Standard deviations are multiplied by factor x (s / s_mean)^contrast, where s is the fourth
@@ -30,7 +30,7 @@ def disperse(covariance: Tensor, log_prior: Tensor, dispersion: Sequence[Dispers
 
     Args:
         covariance: [N, Z, H, 3] xx, xy, yy, positive definite.
-        log_prior: [N, Z] log p(z|x).
+        probability: [N, Z] p(z|x).
         dispersion: of each step; the last holds beyond; none leaves everything as it is.
 
     Returns:
@@ -42,7 +42,7 @@ def disperse(covariance: Tensor, log_prior: Tensor, dispersion: Sequence[Dispers
     table = covariance.new_tensor(dispersion)[steps]  # [H, 2]
     xx, xy, yy = covariance.unbind(dim=-1)
     log_spread = 0.25 * (xx * yy - xy * xy).log()  # [N, Z, H]
-    mean = (log_prior.exp().unsqueeze(-1) * log_spread).sum(dim=1, keepdim=True)  # [N, 1, H]
+    mean = (probability.unsqueeze(-1) * log_spread).sum(dim=1, keepdim=True)  # [N, 1, H]
     contrast = ((log_spread - mean) * table[:, 1]).exp()
     contrast = contrast.clamp(1.0 / _LARGEST_CONTRAST, _LARGEST_CONTRAST)
     return covariance * (table[:, 0] * contrast).square().unsqueeze(-1)

@@ -12,19 +12,22 @@ every sum weighted by probabilities leaves it out and every covariance is positi
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
+from trajectron_model.config import Dispersion
 from trajectron_model.dispersion import disperse
 from trajectron_model.features import Kinematics, from_frame, to_frame
 from trajectron_model.integration import integrate, walk
+from trajectron_model.kernels import placing
 
 if TYPE_CHECKING:
     from trajectron_model.trajectron import Trajectron
 
-# A position is never known better than this: keeps covariances positive definite.
+# A position is never known better than this: keeps covariances positive definite. As placing.c.
 _VARIANCE_FLOOR_M2 = 1e-6
 
 
@@ -88,20 +91,52 @@ def mode_moments(
     velocity, increment = decoder.moments(prepared, agent, latent, horizons, limit)
     if agent_type.stationary:
         increment = torch.zeros_like(increment)
-    mean = integrate(velocity, dt_s) * scale  # [R, H, 2]
-    covariance = walk(increment, dt_s) * scale**2  # [R, H, 3]
-    row = _rows_of(stays, log_prior)
-    mean, covariance = mean[row], covariance[row]  # [N, Z, H, ...]
+    rollouts = Rollouts(
+        velocity,
+        increment,
+        _rows_of(stays, log_prior),
+        log_prior.exp(),
+        model.features.frame(motion),
+        without_direction(model, motion),
+    )
+    return place(rollouts, dt_s * scale, agent_type.dispersion)
+
+
+class Rollouts(NamedTuple):
+    """R rollouts on the mixture's mean, and whose modes they are."""
+
+    velocity: Tensor  # [R, H, 2] in units of the speed scale, in the agent's frame
+    increment: Tensor  # [R, H, 3] covariances of its changes
+    row: Tensor  # [N, Z] the rollout of each mode
+    probability: Tensor  # [N, Z]
+    axis: Tensor  # [N, 2] the first axis of the agent's frame
+    turned: Tensor  # [N] whether any direction is as likely as any other
+
+
+def place(
+    rollouts: Rollouts, unit_m: float, dispersion: Sequence[Dispersion]
+) -> tuple[Tensor, Tensor]:
+    """Modes in position space, world axes.
+
+    Args:
+        rollouts: of N nodes.
+        unit_m: metres that one unit of velocity makes in a step.
+        dispersion: see ``dispersion``.
+
+    Returns:
+        mean [N, Z, H, 2] as offsets in metres and covariance [N, Z, H, 3].
+    """
+    done = placing.place(rollouts, unit_m, dispersion)
+    if done is not None:
+        return done
+    mean = integrate(rollouts.velocity, unit_m)[rollouts.row]  # [N, Z, H, 2]
+    covariance = walk(rollouts.increment, unit_m)[rollouts.row]  # [N, Z, H, 3]
     floor = covariance.new_tensor([_VARIANCE_FLOOR_M2, 0.0, _VARIANCE_FLOOR_M2])
-    covariance = disperse(covariance + floor, log_prior, agent_type.dispersion)
-    axis = model.features.frame(motion)[:, None, None, :]
-    turned = without_direction(model, motion)
-    placed, spread = from_frame(mean, axis), _rotate(covariance, axis)
-    if turned.any():
-        where = turned[:, None, None, None]
-        spread = torch.where(where, _every_direction(mean, covariance), spread)
-        placed = torch.where(where, 0.0, placed)
-    return placed, spread
+    covariance = disperse(covariance + floor, rollouts.probability, dispersion)
+    axis = rollouts.axis[:, None, None, :]
+    turned = rollouts.turned[:, None, None, None]
+    spread = torch.where(turned, _every_direction(mean, covariance), _rotate(covariance, axis))
+    return torch.where(turned, 0.0, from_frame(mean, axis)), spread
 
 
 def _rows_of(stays: Tensor, log_prior: Tensor) -> Tensor:

@@ -23,12 +23,12 @@ LEVELS = np.array([0.5, 0.8, 0.9, 0.95])
 
 def test_without_dispersion_covariances_stay() -> None:
     covariance = torch.tensor([[[[4.0, 1.0, 2.0]]]])
-    assert disperse(covariance, torch.zeros(1, 1), ()) is covariance
+    assert disperse(covariance, torch.ones(1, 1), ()) is covariance
 
 
 def test_a_factor_scales_standard_deviations_and_the_last_holds_beyond() -> None:
     covariance = torch.tensor([4.0, 1.0, 2.0]).repeat(1, 1, 3, 1)  # [1, 1, 3, 3]
-    scaled = disperse(covariance, torch.zeros(1, 1), (Dispersion(0.5, 0.0), Dispersion(2.0, 0.0)))
+    scaled = disperse(covariance, torch.ones(1, 1), (Dispersion(0.5, 0.0), Dispersion(2.0, 0.0)))
     expected = [[1.0, 0.25, 0.5], [16.0, 4.0, 8.0], [16.0, 4.0, 8.0]]
     assert torch.allclose(scaled[0, 0], torch.tensor(expected))
 
@@ -37,8 +37,8 @@ def test_a_contrast_widens_the_wide_modes_and_narrows_the_narrow_ones() -> None:
     # Spreads 1 and 4, equally probable: their geometric mean is 2, so with contrast 1 the
     # standard deviations become 1 x 1/2 and 4 x 2.
     covariance = torch.tensor([[[[1.0, 0.0, 1.0]], [[16.0, 0.0, 16.0]]]])
-    log_prior = torch.log(torch.tensor([[0.5, 0.5]]))
-    scaled = disperse(covariance, log_prior, (Dispersion(1.0, 1.0),))
+    probability = torch.tensor([[0.5, 0.5]])
+    scaled = disperse(covariance, probability, (Dispersion(1.0, 1.0),))
     assert torch.allclose(scaled[0, :, 0, 0], torch.tensor([0.25, 64.0]))
 
 

@@ -70,8 +70,8 @@ def coverage(recordings: Sequence[Judged], dispersion: Sequence[Dispersion]) -> 
     random = np.random.default_rng(_SEED)
     shares = []
     for judged in recordings:
-        log_prior = torch.from_numpy(judged.mixture.probability).clamp_min(1e-12).log()
-        covariance = disperse(torch.from_numpy(judged.mixture.covariance), log_prior, dispersion)
+        probability = torch.from_numpy(judged.mixture.probability)
+        covariance = disperse(torch.from_numpy(judged.mixture.covariance), probability, dispersion)
         mixture = replace(judged.mixture, covariance=covariance.numpy())
         regions = highest_density_regions(mixture, judged.truth, random)
         shares.append(regions.covered.mean(axis=1))  # [L, H]
