@@ -18,7 +18,7 @@ from torch import Tensor
 from trajectron_model.config import Dispersion
 
 _LARGEST_CONTRAST = 20.0
-"""A mode is made at most so many times wider or narrower than its agent's modes are; as placing.c."""
+"""A mode is made at most so many times wider or narrower than its agent's modes; as placing.c."""
 
 
 def disperse(covariance: Tensor, probability: Tensor, dispersion: Sequence[Dispersion]) -> Tensor:

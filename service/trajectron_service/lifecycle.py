@@ -8,6 +8,7 @@ is refused, work in hand finishes within ``drain_grace_s``, then the servers clo
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -79,6 +80,9 @@ def serve(settings: Settings) -> None:
 async def _serve(settings: Settings) -> None:
     with _stop_signals() as stop:
         async with running(settings) as service:
+            # What is here now stays: no collection of cycles need look at it again.
+            gc.collect()
+            gc.freeze()
             loop = asyncio.get_running_loop()
             loop.add_signal_handler(signal.SIGHUP, service.admission.reload)
             log.info(

@@ -50,7 +50,10 @@ def sanitized(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_kernels_tests_hold_under_sanitizers() -> None:
-    done = sanitized("tests/model/test_packed.py", "tests/model/test_kernel_decoding.py")
+    kernels = ("decoding", "placing")
+    done = sanitized(
+        "tests/model/test_packed.py", *(f"tests/model/test_kernel_{name}.py" for name in kernels)
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "passed" in done.stdout
 

@@ -1,4 +1,4 @@
-"""Modes placed by the kernel are torch's, and each agent's are the same whoever stands beside it."""
+"""Modes placed by the kernel are torch's, and an agent's do not depend on who stands beside it."""
 
 from __future__ import annotations
 
