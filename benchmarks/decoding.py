@@ -1,10 +1,12 @@
 """Times forecasts beside the bare matrix products of the decoder, and beside torch alone.
 
 The floor of ``full`` is the recurrent and head products of the shipped decoder, rows = agents x
-samples, the terms of z and h_enc taken out of the loop, by torch; that of ``gmm`` the same with
-rows = agents x latent values. In float32, or in bfloat16 where a trial finds that quicker (a
-processor without it takes minutes for them). Forecasts are whole: from states to arrays, noise
-included. Every figure is measured in turn with its floor; ratios are taken pair by pair.
+samples, the terms of z and h_enc taken out of the loop; that of ``gmm`` the same with rows =
+agents x latent values. There are two: in float32 by torch (or bfloat16, where a trial finds that
+quicker; a processor without it takes minutes for them), and in 16-bit integers by the kernel's
+own tiles, which is the quickest format that forecasts are made in, on one thread. Forecasts are
+whole: from states to arrays, noise included. Every figure is measured in turn with its floors;
+ratios are taken pair by pair.
 
     python -m benchmarks.decoding [--threads 2] [--repeats 9] [--check] [--json FILE]
 
@@ -29,6 +31,7 @@ from benchmarks.runtime import about
 from trajectron_model import kernels, online, registry
 from trajectron_model.decoder import Decoder
 from trajectron_model.forecast import ForecastRequest
+from trajectron_model.kernels import decoding
 from trajectron_model.trajectron import Trajectron
 
 FULL_AGENTS = (1, 5, 20, 40, 200, 1000)
@@ -55,8 +58,10 @@ class Row:
     ours_low_ms: float
     ours_high_ms: float
     floor_ms: float
+    integers_ms: float | None
     torch_ms: float | None
     of_floor: float
+    of_integers: float | None
     torch_of_ours: float | None
 
 
@@ -107,40 +112,64 @@ def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torc
         with kernels.without():
             return model.forecast([state], [request])
 
-    calls = [ours, products(decoder, rows, floor)]
-    if agents <= _TORCH_UP_TO:
-        calls.append(torch_alone)
     with torch.inference_mode():
-        for call in calls:
+        integers = decoding.products(decoder, rows, HORIZON)
+    calls: dict[str, Callable[[], object]] = {
+        "ours": ours,
+        "floor": products(decoder, rows, floor),
+    }
+    if integers is not None:
+        calls["integers"] = integers
+    if agents <= _TORCH_UP_TO:
+        calls["torch"] = torch_alone
+    with torch.inference_mode():
+        for call in calls.values():
             call()
-        times = [[seconds(call) for call in calls] for _ in range(repeats)]
-    columns = [[1e3 * t for t in column] for column in zip(*times, strict=True)]
-    middle = [statistics.median(column) for column in columns]
-    ratios = [
-        statistics.median(a / b for a, b in zip(columns[0], column, strict=True))
-        for column in columns
-    ]
-    measured_torch = len(calls) == 3
+        times = [[1e3 * seconds(call) for call in calls.values()] for _ in range(repeats)]
+    columns = dict(zip(calls, zip(*times, strict=True), strict=True))
+
+    def middle(name: str) -> float | None:
+        return statistics.median(columns[name]) if name in columns else None
+
+    def ratio(name: str) -> float | None:
+        """Of ours to another's."""
+        pairs = zip(columns["ours"], columns.get(name, ()), strict=False)
+        return statistics.median([a / b for a, b in pairs]) if name in columns else None
+
+    ours_ms, floor_ms = middle("ours"), middle("floor")
+    of_floor, of_torch = ratio("floor"), ratio("torch")
+    assert ours_ms is not None and floor_ms is not None and of_floor is not None
     return Row(
-        *(mode, agents, repeats, middle[0], min(columns[0]), max(columns[0])),
-        *(middle[1], middle[2] if measured_torch else None),
-        *(ratios[1], 1.0 / ratios[2] if measured_torch else None),
+        mode=mode,
+        agents=agents,
+        repeats=repeats,
+        ours_ms=ours_ms,
+        ours_low_ms=min(columns["ours"]),
+        ours_high_ms=max(columns["ours"]),
+        floor_ms=floor_ms,
+        integers_ms=middle("integers"),
+        torch_ms=middle("torch"),
+        of_floor=of_floor,
+        of_integers=ratio("integers"),
+        torch_of_ours=None if of_torch is None else 1.0 / of_torch,
     )
 
 
 def table(rows: list[Row]) -> str:
     """The figures as Markdown."""
     lines = [
-        "| forecast | agents | ours ms | bare ms | torch ms | ours / bare | torch / ours |",
-        "| --- " * 7 + "|",
+        "| forecast | agents | ours ms | bare ms | integers ms | torch ms | of bare | of integers | torch / ours |",
+        "| --- " * 9 + "|",
     ]
     for row in rows:
-        by_torch_ms = "-" if row.torch_ms is None else f"{row.torch_ms:.1f}"
-        gain = "-" if row.torch_of_ours is None else f"{row.torch_of_ours:.2f}"
+        optional = [row.integers_ms, row.torch_ms, row.of_integers, row.torch_of_ours]
+        integers_ms, torch_ms, of_integers, gain = (
+            "-" if figure is None else f"{figure:.2f}" for figure in optional
+        )
         lines.append(
             f"| {row.mode} | {row.agents} | {row.ours_ms:.2f} ({row.ours_low_ms:.2f} to "
-            f"{row.ours_high_ms:.2f}) | {row.floor_ms:.2f} "
-            f"| {by_torch_ms} | {row.of_floor:.2f} | {gain} |"
+            f"{row.ours_high_ms:.2f}) | {row.floor_ms:.2f} | {integers_ms} | {torch_ms} "
+            f"| {row.of_floor:.2f} | {of_integers} | {gain} |"
         )
     lines.append(f"\nCost per agent, 1000 agents against 40: {growth(rows):.2f}")
     return "\n".join(lines)

@@ -469,3 +469,28 @@ KERNEL void trajectron_decode_moments(const Decoder *decoder, const Rollouts *al
         }
     }
 }
+
+/* The products of `steps` steps of `rows` rollouts, and nothing else: what decoding cannot do
+ * without. Of whatever is in the workspace; benchmarks compare with it.
+ */
+KERNEL void trajectron_decode_products(const Decoder *decoder, int64_t rows, int64_t steps,
+                                       void *workspace) {
+    Block *block = block_in(workspace, decoder);
+    const long units = decoder->units;
+    memset(block->hidden, 0, (size_t)(BLOCK_ROWS * units) * sizeof(int16_t));
+    for (; rows > 0; rows -= BLOCK_ROWS) {
+        const long filled = whole_tiles(rows < BLOCK_ROWS ? rows : BLOCK_ROWS);
+        for (int64_t t = 0; t < steps; t++) {
+            for (long unit = 0; unit < units; unit += LANES) {
+                const int16_t *panel = decoder->recurrent + unit * PANEL_VECTORS * units;
+                for (long first = 0; first < filled; first += TILE_ROWS) {
+                    vi sums[TILE_ROWS * PANEL_VECTORS] = {{0}};
+                    fixed_tile(TILE_ROWS, PANEL_VECTORS, panel, units / 2,
+                               block->hidden + first * units, units, sums);
+                    memcpy(block->gates + first * 4 * units, sums, sizeof sums);
+                }
+            }
+            read_mixture(decoder, filled, block);
+        }
+    }
+}

@@ -122,6 +122,28 @@ def moments(
     return means, covariances
 
 
+def products(decoder: Decoder, rows: int, steps: int) -> Callable[[], None] | None:
+    """The bare products of so many rollouts, to be timed; None where there is no kernel."""
+    library = library_for(decoder.head.weight)
+    if library is None:
+        return None
+    packed = _PACKED.of(decoder, library)
+
+    def run() -> None:
+        _space, workspace = _workspace(packed)  # the memory lives as long as its name
+        library.library.trajectron_decode_products(
+            ctypes.byref(packed.struct), ctypes.c_int64(rows), ctypes.c_int64(steps), workspace
+        )
+
+    return run
+
+
+def _workspace(packed: _Packed) -> tuple[np.ndarray, ctypes.c_void_p]:
+    """Memory for one call, and where in it to begin."""
+    space = np.empty(packed.workspace_bytes + 64, dtype=np.uint8)
+    return space, ctypes.c_void_p(-space.ctypes.data % 64 + space.ctypes.data)
+
+
 def _run(
     decoder: Decoder,
     library: Kernels,
@@ -166,9 +188,8 @@ def _run(
     )
 
     def work(first: int, last: int) -> None:
-        space = np.empty(packed.workspace_bytes + 64, dtype=np.uint8)
-        aligned = -space.ctypes.data % 64 + space.ctypes.data
-        span = (ctypes.c_int64(first), ctypes.c_int64(last), ctypes.c_void_p(aligned))
+        _space, workspace = _workspace(packed)  # the memory lives as long as its name
+        span = (ctypes.c_int64(first), ctypes.c_int64(last), workspace)
         function(ctypes.byref(packed.struct), ctypes.byref(rollouts), *arrays, *span)
 
     share(len(order), _LEAST_ROWS, work)
