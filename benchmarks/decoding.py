@@ -157,10 +157,8 @@ def measure(model: Trajectron, mode: str, agents: int, repeats: int, floor: torc
 
 def table(rows: list[Row]) -> str:
     """The figures as Markdown."""
-    lines = [
-        "| forecast | agents | ours ms | bare ms | integers ms | torch ms | of bare | of integers | torch / ours |",
-        "| --- " * 9 + "|",
-    ]
+    titles = "forecast agents ours_ms bare_ms integers_ms torch_ms of_bare of_integers torch/ours"
+    lines = [f"| {titles.replace(' ', ' | ')} |", "| --- " * 9 + "|"]
     for row in rows:
         optional = [row.integers_ms, row.torch_ms, row.of_integers, row.torch_of_ours]
         integers_ms, torch_ms, of_integers, gain = (
