@@ -31,6 +31,7 @@ from collections import ChainMap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,11 @@ class TokensFile:
     tokens: tuple[Token, ...]
     tenants: Mapping[str, Quotas]
     others: Quotas
+
+    @cached_property
+    def by_sha256(self) -> Mapping[str, Token]:
+        """The tokens by what is kept of them."""
+        return {token.sha256: token for token in self.tokens}
 
 
 def new_token() -> str:
@@ -158,21 +164,21 @@ class Tokens:
 
         All entries are compared, each in constant time: how long it takes tells nothing.
         """
-        return self._find(digest(presented))
-
-    def again(self, token: Token) -> Token | None:
-        """A token found before as it is now; None when it is gone, has expired, or is another's."""
-        found = self._find(token.sha256)
-        return found if found and found.tenant == token.tenant else None
-
-    def _find(self, sha256: str) -> Token | None:
-        found = None
+        sha256, found = digest(presented), None
         for token in self._file.tokens:
             if hmac.compare_digest(token.sha256, sha256):
                 found = token
-        if found and found.expires_at is not None and found.expires_at <= self._clock():
+        return self._unexpired(found)
+
+    def again(self, token: Token) -> Token | None:
+        """A token found before as it is now; None when it is gone, has expired, or is another's."""
+        found = self._file.by_sha256.get(token.sha256)
+        return self._unexpired(found) if found and found.tenant == token.tenant else None
+
+    def _unexpired(self, token: Token | None) -> Token | None:
+        if token and token.expires_at is not None and token.expires_at <= self._clock():
             return None
-        return found
+        return token
 
     def look(self) -> None:
         """Reads the file again once it has changed and stays so from one look to the next.
