@@ -64,6 +64,8 @@ class ForecastRequest:
         include_modes: whether means and covariances are given; ``gmm`` always gives them.
         sampling: how one agent's samples go together; see ``noise``.
         horizons: steps of each of ``agents``, 1 to 60, instead of H for all.
+        run: (first, last), half open: of the S samples only these are made, the same as they
+            would be among all S. None for all of them.
 
     Raises:
         ValueError: a number out of its bounds; horizons without agents or not as many.
@@ -78,6 +80,7 @@ class ForecastRequest:
     include_modes: bool = False
     sampling: Sampling = "iid"
     horizons: tuple[int, ...] | None = None
+    run: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in ("full", "z_best", "gmm"):
@@ -86,6 +89,8 @@ class ForecastRequest:
             raise ValueError(f"sampling {self.sampling!r} is none of {', '.join(SAMPLINGS)}")
         if not 1 <= self.num_samples <= MAX_SAMPLES:
             raise ValueError(f"num_samples must be 1 to {MAX_SAMPLES}")
+        if self.run is not None and not 0 <= self.run[0] < self.run[1] <= self.num_samples:
+            raise ValueError("run must be some of the samples")
         for steps in (self.horizon, *(self.horizons or ())):
             if not 1 <= steps <= MAX_HORIZON:
                 raise ValueError(f"horizon must be 1 to {MAX_HORIZON} steps")
@@ -96,8 +101,10 @@ class ForecastRequest:
 
     @property
     def samples(self) -> int:
-        """How many samples are drawn: none for ``gmm``."""
-        return 0 if self.mode == "gmm" else self.num_samples
+        """How many samples are made: none for ``gmm``."""
+        if self.mode == "gmm":
+            return 0
+        return self.num_samples if self.run is None else self.run[1] - self.run[0]
 
     @property
     def modes(self) -> bool:
@@ -351,8 +358,10 @@ def _noise(
     of_request = attrgetter("request", "horizon")
     for (number, horizon), same in groupby((agents.agents[i] for i in wanted), key=of_request):
         asked, ids = requests[number], [agent.id for agent in same]
-        noise = scene_noise(asked.seed, ids, asked.step, asked.samples, horizon, asked.sampling)
-        drawn.append([_longer(part.reshape(-1, *part.shape[2:]), steps) for part in noise])
+        noise = scene_noise(asked.seed, ids, asked.step, asked.num_samples, horizon, asked.sampling)
+        run = slice(*(asked.run or (None,)))
+        wished = (part[:, run] for part in noise)
+        drawn.append([_longer(part.reshape(-1, *part.shape[2:]), steps) for part in wished])
     columns = [np.concatenate(column) for column in zip(*drawn, strict=True)]  # [R, ...]
     return [torch.from_numpy(column).to(agents.encoding.device) for column in columns]
 

@@ -2,7 +2,9 @@
 
 The same request gives an agent the same samples whatever else is in the scene or batch,
 in whatever order agents stand, on whichever machine. Asking for another number of samples
-or steps is another request: fewer samples are not the first of more.
+or steps is another request: fewer samples are not the first of more. Whoever wants the first of
+more draws the noise of all and takes its part (``ForecastRequest.run``); of stratified samples
+that is a random part, each with the same distribution, spread less evenly than as many asked for.
 
 An agent's samples go together in one of two ways. Each sample alone has exactly the same
 distribution in both, so estimates from samples are unbiased in both; agents are independent.

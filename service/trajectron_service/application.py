@@ -197,8 +197,8 @@ class Application:
                 type_map=type_map,
             )
             requests = [FrameRequest(frame) for frame in frames[:-1]]
-            requests.append(FrameRequest(frames[-1], options))
-            async with self._until(deadline) as limit:
+            async with self._until(_sooner(deadline, options.deadline_s)) as limit:
+                requests.append(FrameRequest(frames[-1], options, deadline=limit))
                 with self._usage.taken(Rate.FRAMES, len(frames)):
                     _, _, answers = await self._forecaster.fold(
                         self._blank(asked), requests, deadline=limit, strict=True
@@ -267,7 +267,7 @@ class Application:
 
         with self._work.taken():
             self._choices.check_options(options)
-            async with self._until(deadline) as limit:
+            async with self._until(_sooner(deadline, options.deadline_s)) as limit:
                 record, forecast = await self._sessions.change(key, look)
         newest = record.timeline.newest
         if self._accuracy is not None and newest is not None:
@@ -298,7 +298,7 @@ class Application:
                 session,
                 resumed,
                 options,
-                fold=lambda requests, deadline: self._fold(key, requests, deadline),
+                fold=lambda requests: self._fold(key, requests, None),
                 on_end=lambda: self._sessions.delete(key, STREAM_ENDED),
                 busy=lambda: self._streaming(key),
                 on_close=counted.pop_all().close,
@@ -459,6 +459,14 @@ def _past(kind: ErrorKind) -> Iterator[None]:
     except ServiceError as error:
         if error.kind is not kind:
             raise
+
+
+def _sooner(deadline: float | None, deadline_s: float | None) -> float | None:
+    """The earlier one of a deadline and of so many seconds from now."""
+    if deadline_s is None:
+        return deadline
+    own = time.monotonic() + deadline_s
+    return own if deadline is None else min(deadline, own)
 
 
 def _key(session_id: str) -> SessionKey:

@@ -188,6 +188,7 @@ class Batcher(Generic[JobT, ResultT]):
         key: Hashable = None,
         deadline: float | None = None,
         urgent: bool = False,
+        finish: bool = False,
     ) -> list[ResultT]:
         """The results of parts of one piece of work, in order; several make it long work.
 
@@ -196,6 +197,7 @@ class Batcher(Generic[JobT, ResultT]):
             key: None stands in no line but its own.
             deadline: on the batcher's clock.
             urgent: goes before all that is not.
+            finish: once begun it is done to the end, and its results come late rather than not.
 
         Raises:
             QueueFull, TooLate, Closed: at once, without waiting; TooLate also when other work
@@ -207,6 +209,8 @@ class Batcher(Generic[JobT, ResultT]):
         line_key = key if key is not None else entry
         left_s = None if deadline is None else deadline - entry.queued_at
         try:
+            if finish:
+                return await _finished(entry, left_s)
             async with asyncio.timeout(left_s):
                 return await entry.done
         except TimeoutError:
@@ -254,15 +258,20 @@ class Batcher(Generic[JobT, ResultT]):
 
     def check(self, parts: Sequence[Part[JobT]], *, deadline: float | None) -> None:
         """Raises TooLate for work that would not be done by its deadline."""
+        late = self.late(parts, deadline=deadline)
+        if late is not None:
+            if late.own_s > late.left_s:
+                self.pace.doubt(parts[0].work)
+            raise late
+
+    def late(self, parts: Sequence[Part[JobT]], *, deadline: float | None) -> TooLate | None:
+        """Why work would not be done by its deadline; None if it would."""
         if deadline is None or deadline == _NEVER:
-            return
+            return None
         left_s = deadline - self._clock()
         own_s = self.pace.batch_s + self._seconds(parts)
         queue_s = self.queue_s(deadline)
-        if queue_s + own_s > left_s:
-            if own_s > left_s:
-                self.pace.doubt(parts[0].work)
-            raise TooLate(queue_s, own_s, left_s)
+        return TooLate(queue_s, own_s, left_s) if queue_s + own_s > left_s else None
 
     def queue_s(self, deadline: float) -> float:
         """Seconds until what goes before work with this deadline is done."""
@@ -430,6 +439,19 @@ def _turn(line: _Line[JobT, ResultT]) -> tuple[bool, int, float, int]:
     """The place of a line in the order of the queue."""
     first = line.entries[0]
     return (not first.urgent, line.round, first.deadline, first.arrival)
+
+
+async def _finished(entry: _Entry[JobT, ResultT], left_s: float | None) -> list[ResultT]:
+    """The results of an entry that begins in time, however long it then takes."""
+    try:
+        await asyncio.wait({entry.done}, timeout=left_s)
+        if entry.started or entry.done.done():
+            return await entry.done
+    except asyncio.CancelledError:
+        entry.done.cancel()
+        raise
+    entry.done.cancel()
+    raise Expired("the deadline passed in the queue")
 
 
 def _put(entry: _Entry[JobT, ResultT], result: ResultT) -> None:

@@ -110,6 +110,7 @@ class Choices:
         _bounded("num_samples", options.num_samples, 1, self.settings.max_samples)
         _bounded("horizon", options.horizon, 1, self.settings.max_horizon)
         _bounded("seed", options.seed, 0, SEED_BOUND - 1)
+        check_deadline(options.deadline_s)
         places: dict[str, int] = {}
         for row, agent in enumerate(options.agents or ()):
             if agent in places:
@@ -117,9 +118,14 @@ class Choices:
             places[agent] = row
 
     def task(
-        self, options: ForecastOptions, timeline: Timeline, version: int, model: ModelFacts
+        self,
+        options: ForecastOptions,
+        timeline: Timeline,
+        version: int,
+        model: ModelFacts,
+        deadline: float | None = None,
     ) -> ForecastTask:
-        """The forecast asked for, from the newest frame.
+        """The forecast asked for, from the newest frame, by ``deadline``.
 
         Raises:
             ServiceError: no frame yet, an agent that is not in the scene, or too much at once.
@@ -151,6 +157,8 @@ class Choices:
                 mode is ForecastMode.GMM if options.include_modes is None else options.include_modes
             ),
             sampling=options.sampling,
+            deadline=deadline,
+            allow_fewer=options.allow_fewer_samples,
         )
         self._check_size(task, model)
         return task
@@ -176,7 +184,7 @@ class Choices:
 def task_points(task: ForecastTask, model: ModelFacts) -> int:
     """What a forecast costs: agents x samples x steps (latent values instead for ``gmm``)."""
     agents = len(task.agents or task.head.ids)
-    samples = 0 if task.mode is ForecastMode.GMM else task.num_samples
+    samples = task.made
     modes = model.info.latent_values if task.include_modes or not samples else 0
     return agents * (samples + modes) * task.horizon
 
@@ -184,7 +192,7 @@ def task_points(task: ForecastTask, model: ModelFacts) -> int:
 def task_work(task: ForecastTask, model: ModelFacts) -> Work:
     """What a forecast is made of, for the learned pace."""
     agents = len(task.agents or task.head.ids)
-    samples = 0 if task.mode is ForecastMode.GMM else task.num_samples
+    samples = task.made
     modes = model.info.latent_values if task.include_modes or not samples else 0
     step = agents if task.head.frame is not None else 0
     return Work(0.0, step, agents * samples * task.horizon, agents * modes * task.horizon)
@@ -204,6 +212,12 @@ def session_id(wanted: str | None) -> str:
 def _bounded(field: str, value: int | None, least: int, most: int) -> None:
     if value is not None and not least <= value <= most:
         raise invalid(field, f"is {value}; must be {least} to {most}")
+
+
+def check_deadline(deadline_s: float | None) -> None:
+    """Raises for a time to answer in that is none."""
+    if deadline_s is not None and not (math.isfinite(deadline_s) and deadline_s > 0.0):
+        raise invalid("deadline_s", f"is {deadline_s:g} s; must be greater than 0 and finite")
 
 
 def _seconds(field: str, value: float | None, default: float, most: float) -> float:

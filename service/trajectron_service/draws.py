@@ -49,6 +49,7 @@ class _Draw:
             agents=self.agents,
             include_modes=task.include_modes,
             sampling=task.sampling.value,
+            run=task.run,
             horizons=tuple(
                 min(task.horizon + math.ceil(steps), MAX_HORIZON) for steps in self.steps_away
             ),

@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-from trajectron_service import logs
-from trajectron_service.batching import Batcher, Closed, Expired, Part, QueueFull, TooLate
-from trajectron_service.choices import Choices, task_points, task_work
+from trajectron_service.choices import Choices, task_points
 from trajectron_service.errors import ErrorKind, FieldViolation, ServiceError
 from trajectron_service.messages import (
-    AgentForecast,
     Forecast,
     ForecastOptions,
     Frame,
@@ -26,19 +22,13 @@ from trajectron_service.messages import (
     SceneGraph,
 )
 from trajectron_service.metrics import Metrics
-from trajectron_service.pace import Work
 from trajectron_service.quotas import Rate, Usage
 from trajectron_service.records import SceneRecord
+from trajectron_service.running import Done, Drawn, Runner, SceneBatcher
 from trajectron_service.scenes import ForecastTask, ModelFacts, SceneJob, SceneResult
 from trajectron_service.timebase import Observation, Step, advance, classify, head
 from trajectron_service.validation import Checked, check, quoted
 
-log = logs.get(__name__)
-
-# An agent's encoder step costs about as much as this many sampled positions.
-_STEP_POINTS = 20
-# A forecast that takes longer than this is made in slices, so that others have their turn.
-_SLICE_S = 0.025
 # Checking this many agents takes some milliseconds; then others have their turn on the loop.
 _AGENTS_PER_TURN = 2000
 _REFUSED = {
@@ -48,20 +38,20 @@ _REFUSED = {
     "be changed",
 }
 
-SceneBatcher = Batcher[SceneJob, SceneResult]
-
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
     """A frame to fold, what to forecast after it (None: nothing), its number on a stream.
 
-    ``fault`` says why what was asked of it means nothing; the answer repeats it.
+    The forecast is wanted by ``deadline``, on ``time.monotonic``. ``fault`` says why what was
+    asked of it means nothing; the answer repeats it.
     """
 
     frame: Frame
     options: ForecastOptions | None = None
     sequence: int | None = None
     fault: ServiceError | None = None
+    deadline: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +88,7 @@ class Forecaster:
     ) -> None:
         self._usage = usage
         self._choices = choices
-        self._batcher = batcher
+        self._runner = Runner(choices, batcher, metrics)
         self._metrics = metrics
 
     async def fold(
@@ -114,28 +104,30 @@ class Forecaster:
         """The record after the frames, its packed states if asked for, an answer to each frame.
 
         A refused frame leaves the others, unless ``strict``: then it raises, as does a
-        forecast that cannot be made, and no work is done.
+        forecast that cannot be made, and no work is done. ``deadline`` is that of frames without
+        a forecast; a forecast has its request's.
 
         Raises:
             ServiceError: the work could not be done; none of the frames counts.
         """
         folded = await self._fold(record, requests)
         result = None
+        answers = folded.answers
         try:
             if strict:
-                _raise_first(folded.answers)
-            if folded.steps or folded.tasks:
+                _raise_first(answers)
+            if folded.tasks:
                 job = self._job(record, folded, pack)
-                result = await self._run(job, key, deadline)
+                done = await self._runner.forecast(job, key, strict=strict)
+                result = done.result
+                self._note_forecasts(record, folded, done)
+            elif folded.steps:
+                job = self._job(record, folded, pack)
+                result = await self._runner.run(job, key, deadline)
         except ServiceError:
             self._usage.give_back(Rate.POINTS, folded.points)
             raise
         after, packed = _with_states(folded.record, record, result)
-        answers = folded.answers
-        for number, (index, task) in enumerate(folded.tasks.items()):
-            assert result is not None  # there were tasks
-            forecast = self._forecast(record, task, result.forecasts[number])
-            answers[index] = dataclasses.replace(answers[index], forecast=forecast)
         for answer in answers:
             self._metrics.frames.labels(answer.result.outcome.value).inc()
         if after.version != record.version:
@@ -152,12 +144,16 @@ class Forecaster:
     ) -> tuple[SceneRecord, Forecast]:
         """The futures from the newest frame; the record comes back with live states."""
         model = self._model(record)
-        task = self._choices.task(options, record.timeline, record.version, model)
+        task = self._choices.task(options, record.timeline, record.version, model, deadline)
         job = dataclasses.replace(_idle_job(record), forecasts=(task,))
-        with self._usage.taken(Rate.POINTS, task_points(task, model)):
-            result = await self._run(job, key, deadline)
-        after, _ = _with_states(record, record, result)
-        return after, self._forecast(record, task, result.forecasts[0])
+        points = task_points(task, model)
+        with self._usage.taken(Rate.POINTS, points):
+            done = await self._runner.forecast(job, key, strict=True)
+        after, _ = _with_states(record, record, done.result)
+        (made,) = done.forecasts
+        assert isinstance(made, Drawn)  # strict: else it has raised
+        self._usage.give_back(Rate.POINTS, points - task_points(made.task, model))
+        return after, self._forecast(record, made)
 
     async def graph(
         self, record: SceneRecord, *, key: Hashable = None, deadline: float | None
@@ -168,7 +164,7 @@ class Forecaster:
         self._model(record)
         where = head(record.timeline)
         job = dataclasses.replace(_idle_job(record), graph=where)
-        result = await self._run(job, key, deadline)
+        result = await self._runner.run(job, key, deadline)
         assert result.graph is not None  # asked for
         after, _ = _with_states(record, record, result)
         return after, result.graph
@@ -178,7 +174,7 @@ class Forecaster:
         if isinstance(record.states, bytes):
             return record.states
         job = dataclasses.replace(_idle_job(record), pack=True)
-        result = await self._run(job, None, None)
+        result = await self._runner.run(job, None, None)
         assert result.packed is not None  # asked for
         return result.packed
 
@@ -211,7 +207,9 @@ class Forecaster:
         wanted = request.options is not None and not answer.stale and not answer.result.refused
         if wanted and request.options is not None:
             try:
-                task = self._choices.task(request.options, record.timeline, record.version, model)
+                task = self._choices.task(
+                    request.options, record.timeline, record.version, model, request.deadline
+                )
                 points = task_points(task, model)
                 self._usage.take(Rate.POINTS, points)
                 fold.points += points
@@ -262,107 +260,24 @@ class Forecaster:
             pack=pack,
         )
 
-    async def _run(self, job: SceneJob, key: Hashable, deadline: float | None) -> SceneResult:
-        """Does a job: at once, or, when its forecasts take long, in slices between other work."""
-        model = self._choices.model(job.model)
-        shares = [self._shares(task, model) for task in job.forecasts]
-        if max(shares, default=1) == 1 or not _from_kept(job):
-            parts = [self._part(job, model)]
-            (result,) = await self._submit(parts, key, deadline, urgent=_observes(job))
-            return result
-        slices = [
-            dataclasses.replace(task, share=(share, count))
-            for task, count in zip(job.forecasts, shares, strict=True)
-            for share in range(count)
-        ]
-        stepping = self._part(dataclasses.replace(job, forecasts=()), model)
-        drawing = [self._slice(job, one, model) for one in slices]
-        self._refuse_late([stepping, *drawing], deadline)
-        (stepped,) = await self._submit([stepping], key, deadline, urgent=True)
-        # Slices are made from the states after the steps, so only now are they whole jobs.
-        live = [
-            dataclasses.replace(
-                part, job=dataclasses.replace(part.job, states=stepped.states, serials=job.keep)
-            )
-            for part in drawing
-        ]
-        drawn = iter(await self._submit(live, key, deadline))
-        forecasts = tuple(
-            tuple(agent for _ in range(count) for agent in next(drawn).forecasts[0])
-            for count in shares
-        )
-        return dataclasses.replace(stepped, forecasts=forecasts)
+    def _note_forecasts(self, record: SceneRecord, fold: _Fold, done: Done) -> None:
+        """Puts what was forecast into the answers; what was not made does not count as used."""
+        made_points = 0
+        for index, made in zip(fold.tasks, done.forecasts, strict=True):
+            answer = fold.answers[index]
+            if isinstance(made, ServiceError):
+                fold.answers[index] = dataclasses.replace(answer, error=made)
+            else:
+                made_points += task_points(made.task, self._model(record))
+                forecast = self._forecast(record, made)
+                fold.answers[index] = dataclasses.replace(answer, forecast=forecast)
+        self._usage.give_back(Rate.POINTS, fold.points - made_points)
 
-    def _shares(self, task: ForecastTask, model: ModelFacts) -> int:
-        """Into how many slices a forecast is cut; none is smaller than one agent."""
-        seconds = self._batcher.pace.seconds(task_work(task, model))
-        agents = len(task.agents or task.head.ids)
-        return max(1, min(agents, math.ceil(seconds / _SLICE_S)))
-
-    def _part(self, job: SceneJob, model: ModelFacts) -> Part[SceneJob]:
-        stepped = sum(len(step.frame.ids) for step in job.steps)
-        drawn = sum(task_points(task, model) for task in job.forecasts)
-        works = [task_work(task, model) for task in job.forecasts]
-        amounts = (sum(column) for column in zip(Work(1.0, stepped), *works, strict=True))
-        return Part(job, drawn + _STEP_POINTS * stepped, Work(*amounts))
-
-    def _slice(self, job: SceneJob, task: ForecastTask, model: ModelFacts) -> Part[SceneJob]:
-        """One slice; its amounts are an equal share of the whole's."""
-        count = task.share[1]
-        whole = task_work(task, model)
-        work = Work(1.0, *(amount / count for amount in whole[1:]))
-        alone = SceneJob(job.model, (), (), forecasts=(task,))
-        return Part(alone, task_points(task, model) / count, work)
-
-    def _refuse_late(self, parts: Sequence[Part[SceneJob]], deadline: float | None) -> None:
-        try:
-            self._batcher.check(parts, deadline=deadline)
-        except TooLate as error:
-            raise _late(error) from None
-
-    async def _submit(
-        self,
-        parts: Sequence[Part[SceneJob]],
-        key: Hashable,
-        deadline: float | None,
-        *,
-        urgent: bool = False,
-    ) -> list[SceneResult]:
-        ticket = self._metrics.tracing.ticket()
-        if ticket is not None:
-            parts = [
-                dataclasses.replace(part, job=dataclasses.replace(part.job, ticket=ticket))
-                for part in parts
-            ]
-        try:
-            return await self._batcher.submit_parts(
-                parts, key=key, deadline=deadline, urgent=urgent
-            )
-        except QueueFull as error:
-            # ``from None``, here and below: refusals are many when there is too much to do, and
-            # each would keep the frames that it came through.
-            raise ServiceError(
-                ErrorKind.OVERLOADED,
-                "the service is busy: too much work waits already; try again later",
-                retry_after_s=error.retry_after_s,
-            ) from None
-        except TooLate as error:
-            raise _late(error) from None
-        except Expired as error:
-            raise ServiceError(ErrorKind.DEADLINE_EXCEEDED, str(error)) from None
-        except Closed:
-            raise ServiceError(ErrorKind.DRAINING, "the service is stopping") from None
-        except Exception as error:
-            job = parts[0].job
-            log.exception("job failed", model=job.model, steps=len(job.steps))
-            raise ServiceError(
-                ErrorKind.INTERNAL, "the model failed on this request; the fault is logged"
-            ) from error
-
-    def _forecast(
-        self, record: SceneRecord, task: ForecastTask, agents: tuple[AgentForecast, ...]
-    ) -> Forecast:
+    def _forecast(self, record: SceneRecord, made: Drawn) -> Forecast:
+        task = made.task
         facts: ModelFacts = self._choices.model(record.model)
+        fewer = 0 < task.made < task.num_samples
+        self._metrics.fewer_samples.inc(fewer)
         return Forecast(
             model=facts.info.name,
             model_hash=facts.info.hash,
@@ -371,24 +286,11 @@ class Forecaster:
             reference_time=task.head.time_s,
             # Rounded: 3 * 0.4 is to read 1.2.
             time_offsets_s=tuple(round(facts.info.dt_s * (h + 1), 9) for h in range(task.horizon)),
-            agents=agents,
+            agents=made.agents,
             sampling=task.sampling,
+            num_samples=task.made,
+            fewer_samples=fewer,
         )
-
-
-def _late(error: TooLate) -> ServiceError:
-    return ServiceError(ErrorKind.DEADLINE_EXCEEDED, f"not begun, for it would be late: {error}")
-
-
-def _observes(job: SceneJob) -> bool:
-    """Whether a job only folds frames, which is quick."""
-    return bool(job.steps) and not job.forecasts
-
-
-def _from_kept(job: SceneJob) -> bool:
-    """Whether all forecasts start from states that the job gives back."""
-    kept = {None, *job.keep}
-    return all(task.head.source in kept for task in job.forecasts)
 
 
 def _idle_job(record: SceneRecord) -> SceneJob:

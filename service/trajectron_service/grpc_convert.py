@@ -102,6 +102,8 @@ def forecast_options(message: pb.ForecastOptions, path: str = "options") -> core
         agents=tuple(message.agent_ids) or None,
         include_modes=message.include_modes if message.HasField("include_modes") else None,
         sampling=_known(_SAMPLINGS, message.sampling, f"{path}.sampling", "a Sampling"),
+        deadline_s=seconds(message.deadline) if message.HasField("deadline") else None,
+        allow_fewer_samples=message.allow_fewer_samples,
     )
 
 
@@ -237,6 +239,8 @@ def forecast_message(forecast: core.Forecast) -> pb.Forecast:
         time_offsets_s=forecast.time_offsets_s,
         sample_semantics=_SEMANTICS_OUT[forecast.sampling],
         mode_probability_floor=forecast.mode_probability_floor,
+        num_samples=forecast.num_samples,
+        fewer_samples=forecast.fewer_samples,
         agents=[_agent_forecast(agent) for agent in forecast.agents],
     )
 

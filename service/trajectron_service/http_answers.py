@@ -73,6 +73,10 @@ class Forecast(Answer):
         "zero, the others' sum to one, and their mean and covariance repeat the most probable "
         "mode's. Above zero for `gmm` only."
     )
+    num_samples: int = Field(description="Samples of each agent; 0 for `gmm`.")
+    fewer_samples: bool = Field(
+        description="Whether they are fewer than asked for: `allow_fewer_samples`."
+    )
     agents: list[AgentForecast] = Field(description="In the order asked for.")
 
 

@@ -35,6 +35,8 @@ def forecast_json(forecast: Forecast) -> dict[str, Any]:
         "time_offsets_s": forecast.time_offsets_s,
         "sample_semantics": forecast.sample_semantics,
         "mode_probability_floor": forecast.mode_probability_floor,
+        "num_samples": forecast.num_samples,
+        "fewer_samples": forecast.fewer_samples,
         "agents": [_agent_json(agent) for agent in forecast.agents],
     }
 

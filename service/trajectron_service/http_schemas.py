@@ -110,6 +110,18 @@ class ForecastOptions(Body):
         "are independent of each other either way.",
     )
 
+    deadline_s: float | None = Field(
+        None,
+        description="Seconds to answer in, from when the request was received, at most the "
+        "server's limit. What would be late is refused with 504, before it costs anything where "
+        "that is certain.",
+    )
+    allow_fewer_samples: bool = Field(
+        False,
+        description="Where all samples would be late: as many as are in time, at least one, "
+        "instead of 504. They are the first ones of all that were asked for. Ignored by `gmm`.",
+    )
+
     def to_options(self) -> core.ForecastOptions:
         """The options as the core takes them."""
         return core.ForecastOptions(
@@ -120,6 +132,8 @@ class ForecastOptions(Body):
             agents=self.agents or None,
             include_modes=self.include_modes,
             sampling=self.sampling,
+            deadline_s=self.deadline_s,
+            allow_fewer_samples=self.allow_fewer_samples,
         )
 
 

@@ -85,7 +85,9 @@ class Frame:
 class ForecastOptions:
     """What to forecast; None asks for the default.
 
-    ``agents`` None means all. ``include_modes`` None means: for ``gmm`` only.
+    ``agents`` None means all. ``include_modes`` None means: for ``gmm`` only. ``deadline_s`` counts
+    from when the request was received. ``allow_fewer_samples`` takes the first samples where all
+    would be late.
     """
 
     mode: ForecastMode = ForecastMode.FULL
@@ -95,6 +97,8 @@ class ForecastOptions:
     agents: tuple[str, ...] | None = None
     include_modes: bool | None = None
     sampling: Sampling = Sampling.IID
+    deadline_s: float | None = None
+    allow_fewer_samples: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +210,8 @@ class Forecast:
     time_offsets_s: tuple[float, ...]  # [H], the first > 0
     agents: tuple[AgentForecast, ...]
     sampling: Sampling = Sampling.IID
+    num_samples: int = 0  # of each agent; 0 for ``gmm``
+    fewer_samples: bool = False  # than asked for, to be in time
 
     @property
     def sample_semantics(self) -> str:

@@ -208,6 +208,11 @@ class Metrics:
             ("tenant", "quota"),
             registry=registry,
         )
+        self.fewer_samples = Counter(
+            "trajectron_forecasts_fewer_samples",
+            "Forecasts of fewer samples than asked for, so that they are in time.",
+            registry=registry,
+        )
         self.tokens = Gauge("trajectron_tokens", "Tokens in force.", registry=registry)
         self.tokens_stale = Gauge(
             "trajectron_tokens_stale",

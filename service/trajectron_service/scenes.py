@@ -32,8 +32,9 @@ class ForecastTask:
     """A forecast from one head, every choice made.
 
     ``step`` is the session's version, part of the key of the noise. ``agents`` None is all.
-    ``share`` (k, n) asks only for the k-th of n runs of these agents, from 0: long forecasts are
-    made in slices.
+    ``share`` (k, n) asks only for the k-th of n runs of these agents, from 0, and ``run`` (first,
+    last) only for these of the samples: long forecasts are made in slices. ``deadline`` is on
+    ``time.monotonic``; ``allow_fewer`` lets the first samples do where all would be late.
     """
 
     head: Head
@@ -46,6 +47,16 @@ class ForecastTask:
     include_modes: bool
     sampling: Sampling
     share: tuple[int, int] = (0, 1)
+    run: tuple[int, int] | None = None
+    deadline: float | None = None
+    allow_fewer: bool = False
+
+    @property
+    def made(self) -> int:
+        """Samples of each agent that are made: none for ``gmm``."""
+        if self.mode is ForecastMode.GMM:
+            return 0
+        return self.num_samples if self.run is None else self.run[1] - self.run[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ so that a client that does not wait for replies gets its encoder steps and forec
   for the reader: older ones are left out and marked superseded. The queue of results is long
   and bounded too.
 
-A fault of one frame travels in its reply. A fault of the stream ends it: the session is gone,
+A fault of one frame travels in its reply, and so does a forecast's that would be late: its frame
+is observed all the same. A fault of the stream ends it: the session is gone,
 the server drains, another stream took the session over.
 """
 
@@ -52,7 +53,7 @@ _ENDS_STREAM = frozenset(
 _PASSES = frozenset({ErrorKind.OVERLOADED, ErrorKind.RATE_LIMITED})
 
 # Folds frames into the stream's session: the answers, in order.
-Fold = Callable[[Sequence[FrameRequest], float | None], Awaitable[list[FrameAnswer]]]
+Fold = Callable[[Sequence[FrameRequest]], Awaitable[list[FrameAnswer]]]
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,8 @@ class Stream:
                 if not following.done():
                     break
                 frame = following.result()
-                await self._inbox.put(_Received(self._request(frame), time.monotonic()))
+                now = time.monotonic()
+                await self._inbox.put(_Received(self._request(frame, now), now))
         except StopAsyncIteration:
             pass
         except Exception as error:  # noqa: BLE001 - whatever the transport raises ends the stream
@@ -231,12 +233,17 @@ class Stream:
                 following.cancel()
         await self._inbox.put(_End(fault))
 
-    def _request(self, frame: StreamFrame) -> FrameRequest:
+    def _request(self, frame: StreamFrame, read_at: float) -> FrameRequest:
         """The frame with what is asked of it: its own options before the stream's."""
         options = frame.options
         if options is None and frame.fault is None:
             options = self._options.forecast
-        return FrameRequest(frame.frame, options, frame.sequence, frame.fault)
+        timeout_s = self._limits.frame_timeout_s
+        if options is not None and options.deadline_s is not None:
+            timeout_s = min(timeout_s, options.deadline_s)
+        return FrameRequest(
+            frame.frame, options, frame.sequence, frame.fault, deadline=read_at + timeout_s
+        )
 
     async def _work(self) -> None:
         """Answers what is in the inbox, until the reader says that there is no more."""
@@ -277,29 +284,32 @@ class Stream:
             for place, request in enumerate(requests[:-1]):
                 dropped[place] = request.options is not None
                 requests[place] = dataclasses.replace(request, options=None)
-        deadline = received[0].read_at + self._limits.frame_timeout_s
+        patience = received[0].read_at + self._limits.frame_timeout_s
         try:
-            answers = await self._fold_patiently(requests, deadline)
+            answers = await self._fold_patiently(requests, patience)
         except ServiceError as error:
             if error.kind in _ENDS_STREAM:
                 raise
-            if len(received) > 1:
+            if len(received) > 1 and error.kind is ErrorKind.INTERNAL:
                 # One at a time, so that only the frame at fault fails.
                 return [reply for one in received for reply in await self._answer([one])]
-            return [self._failure(requests[0], error)]
+            return [self._failure(request, error) for request in requests]
         pairs = zip(requests, answers, dropped, strict=True)
         return [self._reply(request, answer, gone) for request, answer, gone in pairs]
 
     async def _fold_patiently(
-        self, requests: Sequence[FrameRequest], deadline: float
+        self, requests: Sequence[FrameRequest], patience: float
     ) -> list[FrameAnswer]:
-        """Folds; a full queue or a used-up rate makes the stream wait: its client slows down."""
+        """Folds; a full queue or a used-up rate makes the stream wait: its client slows down.
+
+        Only forecasts have a deadline: what has been read is observed, however late.
+        """
         while True:
             try:
-                return await self._fold(requests, deadline)
+                return await self._fold(requests)
             except ServiceError as error:
                 pause_s = error.retry_after_s or 0.1
-                late = time.monotonic() + pause_s >= deadline
+                late = time.monotonic() + pause_s >= patience
                 if error.kind not in _PASSES or late:
                     raise
                 await asyncio.sleep(pause_s)

@@ -11,7 +11,7 @@ import orjson
 import pytest
 
 import trajectron_client as tc
-from trajectron_client import operations
+from trajectron_client import json_bodies, operations, protobuf
 from trajectron_proto.v1 import trajectron_pb2 as pb
 from trajectron_service import grpc_convert, http_encode, http_schemas
 from trajectron_service import messages as core
@@ -68,6 +68,21 @@ CARRIERS = pytest.mark.parametrize("carry", [over_grpc, over_http])
 def test_a_forecast_says_that_its_samples_are_stratified(carry: Carrier) -> None:
     stratified = dataclasses.replace(forecast(), sampling=core.Sampling.STRATIFIED)
     assert carry(stratified).sample_semantics == "independent_agents_stratified"
+
+
+@CARRIERS
+def test_a_forecast_says_that_its_samples_are_fewer_than_asked_for(carry: Carrier) -> None:
+    assert not carry(forecast()).fewer_samples
+    got = carry(dataclasses.replace(forecast(), num_samples=7, fewer_samples=True))
+    assert (got.num_samples, got.fewer_samples) == (7, True)
+
+
+def test_a_deadline_and_fewer_samples_are_asked_for_alike() -> None:
+    message = protobuf.forecast_options(deadline_s=0.25, allow_fewer_samples=True)
+    assert message.deadline.ToMilliseconds() == 250
+    assert message.allow_fewer_samples
+    body = json_bodies.forecast_options(deadline_s=0.25, allow_fewer_samples=True)
+    assert body == {"deadline_s": 0.25, "allow_fewer_samples": True}
 
 
 @CARRIERS

@@ -34,6 +34,8 @@ _OPTION_NAMES = (
     "agents",
     "include_modes",
     "sampling",
+    "deadline_s",
+    "allow_fewer_samples",
 )
 
 # By kind, written out again here so that a slip in the service's own table shows.
@@ -278,6 +280,9 @@ def options_message(options: Json) -> pb.ForecastOptions:
     fields["agent_ids"] = fields.pop("agents", None) or ()
     if "mode" in fields:
         fields["mode"] = f"FORECAST_MODE_{fields['mode'].upper()}"
+    if "deadline_s" in fields:
+        fields["deadline"] = Duration()
+        fields["deadline"].FromNanoseconds(round(fields.pop("deadline_s") * 1e9))
     if "sampling" in fields:
         fields["sampling"] = f"SAMPLING_{fields['sampling'].upper()}"
     return pb.ForecastOptions(**fields)
@@ -308,6 +313,8 @@ def forecast_view(message: pb.Forecast) -> Json:
         .removeprefix("SAMPLE_SEMANTICS_")
         .lower(),
         "mode_probability_floor": message.mode_probability_floor,
+        "num_samples": message.num_samples,
+        "fewer_samples": message.fewer_samples,
         "agents": [_agent_view(agent) for agent in message.agents],
     }
 

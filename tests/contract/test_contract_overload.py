@@ -13,6 +13,7 @@ from pathlib import Path
 
 import grpc
 import httpx
+import numpy as np
 import pytest
 import pytest_asyncio
 from tests.contract.drivers import CODES, Driver, GrpcDriver, HttpDriver, RefusalError
@@ -20,6 +21,7 @@ from tests.contract.scenes import Json, walking
 from tests.contract.servers import small_settings
 
 from trajectron_service.lifecycle import Service, running
+from trajectron_service.pace import Work
 
 pytestmark = pytest.mark.asyncio(loop_scope="session")
 
@@ -150,6 +152,50 @@ async def test_what_takes_too_long_is_given_up(hasty: Service, transport: str) -
         assert caught.value.kind == "DEADLINE_EXCEEDED"
         assert caught.value.code == CODES["DEADLINE_EXCEEDED"][transport]
         assert await driver.list_models()
+
+
+@TRANSPORTS
+async def test_a_request_brings_a_deadline_of_its_own(narrow: Service, transport: str) -> None:
+    async with driver_to(narrow, transport) as driver:
+        async with model_held(narrow):
+            with pytest.raises(RefusalError) as caught:
+                await driver.predict(walking(), deadline_s=0.05)
+        assert caught.value.kind == "DEADLINE_EXCEEDED"
+        assert caught.value.code == CODES["DEADLINE_EXCEEDED"][transport]
+        with pytest.raises(RefusalError) as caught:
+            await driver.predict(walking(), deadline_s=0.0)
+        assert (caught.value.kind, caught.value.fields) == ("INVALID_ARGUMENT", ("deadline_s",))
+
+
+@TRANSPORTS
+async def test_fewer_samples_come_in_time_where_that_is_allowed(
+    narrow: Service, transport: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pace = narrow.application._batcher.pace
+    # As if a sample of the three agents took two seconds.
+    monkeypatch.setattr(pace, "_each_s", Work(1e-6, 1e-6, 2.0 / (3 * 4), 1e-6))
+    monkeypatch.setattr(pace, "learn", lambda *_: None)
+    monkeypatch.setattr(pace, "doubt", lambda *_: None)
+    asked: Json = {"num_samples": 30, "horizon": 4, "seed": 7, "mode": "full"}
+    async with driver_to(narrow, transport) as driver:
+        with pytest.raises(RefusalError, match="DEADLINE_EXCEEDED"):
+            await driver.predict(walking(), **asked, deadline_s=20.0)
+        few = await driver.predict(walking(), **asked, deadline_s=20.0, allow_fewer_samples=True)
+        await driver.create_session("hurried")
+        await driver.observe("hurried", walking())
+        again = await driver.predict_session(
+            "hurried", **asked, deadline_s=20.0, allow_fewer_samples=True
+        )
+        await driver.delete_session("hurried")
+        monkeypatch.undo()
+        whole = await driver.predict(walking(), **asked)
+    assert (whole["num_samples"], whole["fewer_samples"]) == (30, False)
+    for forecast in (few, again):
+        assert forecast["fewer_samples"]
+        assert 1 <= forecast["num_samples"] < 10
+        for agent, of_whole in zip(forecast["agents"], whole["agents"], strict=True):
+            first = of_whole["samples"][: forecast["num_samples"]]
+            np.testing.assert_allclose(agent["samples"], first, atol=1e-4)
 
 
 @TRANSPORTS

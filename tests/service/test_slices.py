@@ -9,11 +9,12 @@ import socket
 import threading
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from tests.service.building import Clock, application, predict, same_forecast, turns, walk
 
 from trajectron_model.trajectron import Trajectron
-from trajectron_service import forecaster
+from trajectron_service import running
 from trajectron_service.batching import Batcher, Part, QueueFull, TooLate
 from trajectron_service.errors import ErrorKind, ServiceError
 from trajectron_service.http_server import listen
@@ -229,10 +230,19 @@ async def test_slices_give_the_samples_of_the_whole(
     whole = await predict(app, frames, options)
     batches = app._metrics.registry.get_sample_value
     before = batches("trajectron_batch_jobs_sum") or 0.0
-    monkeypatch.setattr(forecaster, "_SLICE_S", 1e-9)
+    whole_s = app._batcher.pace.seconds(Work(samples=50.0 * 6 * len(whole.agents)))
+    monkeypatch.setattr(running, "_SLICE_S", whole_s / 15)
+    monkeypatch.setattr(app._batcher.pace, "learn", lambda *_: None)
     sliced = await predict(app, frames, options)
-    assert (batches("trajectron_batch_jobs_sum") or 0.0) - before == 1 + 5  # steps, then agents
+    jobs = (batches("trajectron_batch_jobs_sum") or 0.0) - before
+    # The steps, then each agent with its samples in runs: three at least, more for the modes.
+    assert jobs >= 1 + 5 * 3
+    assert (jobs - 1) % 5 == 0
     assert same_forecast(whole, sliced, tolerance_m=1e-5)
+    for one, other in zip(whole.agents, sliced.agents, strict=True):
+        assert one.sample_modes is not None
+        assert other.sample_modes is not None
+        assert np.array_equal(one.sample_modes, other.sample_modes)
     await app.close()
 
 

@@ -107,6 +107,8 @@ class Forecast:
             (``"independent_agents"``) or stratified (``"independent_agents_stratified"``).
         mode_probability_floor: modes that were less probable are left out: their probability
             is zero, and their mean and covariance repeat the most probable mode's.
+        num_samples: of each agent; 0 for ``mode="gmm"``.
+        fewer_samples: whether they are fewer than asked for: ``allow_fewer_samples``.
     """
 
     model: str
@@ -118,6 +120,8 @@ class Forecast:
     agents: tuple[AgentForecast, ...]
     sample_semantics: str
     mode_probability_floor: float = 0.0
+    num_samples: int = 0
+    fewer_samples: bool = False
 
     @property
     def times(self) -> Float64:

@@ -59,6 +59,8 @@ def to_forecast(body: Json) -> Forecast:
         agents=tuple(_agent_forecast(agent) for agent in body["agents"]),
         sample_semantics=body["sample_semantics"],
         mode_probability_floor=body.get("mode_probability_floor", 0.0),
+        num_samples=body.get("num_samples", 0),
+        fewer_samples=body.get("fewer_samples", False),
     )
 
 

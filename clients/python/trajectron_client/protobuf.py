@@ -53,6 +53,8 @@ def forecast_options(**options: Unpack[ForecastOptions]) -> pb.ForecastOptions:
         agent_ids=options.get("agents") or (),
         include_modes=options.get("include_modes"),
         sampling=pb.Sampling.Value(f"SAMPLING_{options.get('sampling', 'iid').upper()}"),
+        deadline=duration(options.get("deadline_s")),
+        allow_fewer_samples=options.get("allow_fewer_samples", False),
     )
 
 
@@ -102,6 +104,8 @@ def to_forecast(message: pb.Forecast) -> Forecast:
         agents=tuple(_agent_forecast(agent) for agent in message.agents),
         sample_semantics=semantics.removeprefix("SAMPLE_SEMANTICS_").lower(),
         mode_probability_floor=message.mode_probability_floor,
+        num_samples=message.num_samples,
+        fewer_samples=message.fewer_samples,
     )
 
 

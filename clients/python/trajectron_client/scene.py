@@ -88,6 +88,10 @@ class ForecastOptions(TypedDict, total=False):
         sampling: how one agent's samples go together: ``"iid"`` (the default), or ``"stratified"``:
             spread evenly over the distribution, so that a few cover more of it. Each alone has
             the same distribution, and agents are independent, either way.
+        deadline_s: seconds for the service to answer in, from when it received the request or
+            frame; what would be late is refused before it costs anything.
+        allow_fewer_samples: where all samples would be late, the first ones, as many as are in
+            time, at least one; the forecast says that they are fewer. Not for ``"gmm"``.
     """
 
     mode: ForecastMode
@@ -97,6 +101,8 @@ class ForecastOptions(TypedDict, total=False):
     agents: Sequence[str] | None
     include_modes: bool | None
     sampling: Sampling
+    deadline_s: float | None
+    allow_fewer_samples: bool
 
 
 class SessionOptions(TypedDict, total=False):

@@ -296,6 +296,8 @@ class ForecastOptions(_message.Message):
     AGENT_IDS_FIELD_NUMBER: _builtins.int
     INCLUDE_MODES_FIELD_NUMBER: _builtins.int
     SAMPLING_FIELD_NUMBER: _builtins.int
+    DEADLINE_FIELD_NUMBER: _builtins.int
+    ALLOW_FEWER_SAMPLES_FIELD_NUMBER: _builtins.int
     mode: Global___ForecastMode.ValueType
     num_samples: _builtins.int
     """Futures per agent, 1 to 2000; default 20. Ignored by FORECAST_MODE_GMM."""
@@ -311,9 +313,22 @@ class ForecastOptions(_message.Message):
     """
     sampling: Global___Sampling.ValueType
     """Ignored by FORECAST_MODE_GMM."""
+    allow_fewer_samples: _builtins.bool
+    """Where all samples would be late: as many as are in time, at least one,
+    instead of DEADLINE_EXCEEDED. They are the first ones of all that were asked
+    for. Ignored by FORECAST_MODE_GMM.
+    """
     @_builtins.property
     def agent_ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Only these agents; all agents in the scene when empty."""
+
+    @_builtins.property
+    def deadline(self) -> _duration_pb2.Duration:
+        """Time to answer in, from when the request or frame was received, beside the
+        call's own deadline and the server's limit. A forecast that would be late is
+        DEADLINE_EXCEEDED, before it costs anything where that is certain; on a
+        stream in the frame's reply, and the frame is observed all the same.
+        """
 
     def __init__(
         self,
@@ -325,11 +340,15 @@ class ForecastOptions(_message.Message):
         agent_ids: _abc.Iterable[_builtins.str] | None = ...,
         include_modes: _builtins.bool | None = ...,
         sampling: Global___Sampling.ValueType = ...,
+        deadline: _duration_pb2.Duration | None = ...,
+        allow_fewer_samples: _builtins.bool = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "horizon", b"horizon", "include_modes", b"include_modes", "num_samples", b"num_samples", "seed", b"seed"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_deadline", b"_deadline", "_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "deadline", b"deadline", "horizon", b"horizon", "include_modes", b"include_modes", "num_samples", b"num_samples", "seed", b"seed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "agent_ids", b"agent_ids", "horizon", b"horizon", "include_modes", b"include_modes", "mode", b"mode", "num_samples", b"num_samples", "sampling", b"sampling", "seed", b"seed"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_deadline", b"_deadline", "_horizon", b"_horizon", "_include_modes", b"_include_modes", "_num_samples", b"_num_samples", "_seed", b"_seed", "agent_ids", b"agent_ids", "allow_fewer_samples", b"allow_fewer_samples", "deadline", b"deadline", "horizon", b"horizon", "include_modes", b"include_modes", "mode", b"mode", "num_samples", b"num_samples", "sampling", b"sampling", "seed", b"seed"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__deadline: _TypeAlias = _typing.Literal["deadline"]  # noqa: Y015
+    _WhichOneofArgType__deadline: _TypeAlias = _typing.Literal["_deadline", b"_deadline"]  # noqa: Y015
     _WhichOneofReturnType__horizon: _TypeAlias = _typing.Literal["horizon"]  # noqa: Y015
     _WhichOneofArgType__horizon: _TypeAlias = _typing.Literal["_horizon", b"_horizon"]  # noqa: Y015
     _WhichOneofReturnType__include_modes: _TypeAlias = _typing.Literal["include_modes"]  # noqa: Y015
@@ -338,6 +357,8 @@ class ForecastOptions(_message.Message):
     _WhichOneofArgType__num_samples: _TypeAlias = _typing.Literal["_num_samples", b"_num_samples"]  # noqa: Y015
     _WhichOneofReturnType__seed: _TypeAlias = _typing.Literal["seed"]  # noqa: Y015
     _WhichOneofArgType__seed: _TypeAlias = _typing.Literal["_seed", b"_seed"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__deadline) -> _WhichOneofReturnType__deadline | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__horizon) -> _WhichOneofReturnType__horizon | None: ...
     @_typing.overload
@@ -756,6 +777,8 @@ class Forecast(_message.Message):
     SAMPLE_SEMANTICS_FIELD_NUMBER: _builtins.int
     AGENTS_FIELD_NUMBER: _builtins.int
     MODE_PROBABILITY_FLOOR_FIELD_NUMBER: _builtins.int
+    NUM_SAMPLES_FIELD_NUMBER: _builtins.int
+    FEWER_SAMPLES_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     model_hash: _builtins.str
     """sha256 of the model's weights, hexadecimal."""
@@ -769,6 +792,10 @@ class Forecast(_message.Message):
     zero, the others' sum to one, and their mean and covariance repeat the most
     probable mode's. Above zero for FORECAST_MODE_GMM only.
     """
+    num_samples: _builtins.int
+    """Samples of each agent; 0 for FORECAST_MODE_GMM."""
+    fewer_samples: _builtins.bool
+    """Whether they are fewer than asked for (ForecastOptions.allow_fewer_samples)."""
     @_builtins.property
     def time_offsets_s(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """[H] after reference_time_s, the first greater than zero."""
@@ -787,10 +814,12 @@ class Forecast(_message.Message):
         sample_semantics: Global___SampleSemantics.ValueType = ...,
         agents: _abc.Iterable[Global___AgentForecast] | None = ...,
         mode_probability_floor: _builtins.float = ...,
+        num_samples: _builtins.int = ...,
+        fewer_samples: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "mode", b"mode", "mode_probability_floor", b"mode_probability_floor", "model", b"model", "model_hash", b"model_hash", "reference_time_s", b"reference_time_s", "sample_semantics", b"sample_semantics", "seed", b"seed", "time_offsets_s", b"time_offsets_s"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "fewer_samples", b"fewer_samples", "mode", b"mode", "mode_probability_floor", b"mode_probability_floor", "model", b"model", "model_hash", b"model_hash", "num_samples", b"num_samples", "reference_time_s", b"reference_time_s", "sample_semantics", b"sample_semantics", "seed", b"seed", "time_offsets_s", b"time_offsets_s"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

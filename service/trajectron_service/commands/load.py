@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trajectron_service.commands.options import Horizon, Mode, Samples, out
+from trajectron_service.commands.options import (
+    AllowFewerSamples,
+    Horizon,
+    Mode,
+    Samples,
+    TimeoutS,
+    out,
+)
 
 if TYPE_CHECKING:
     from trajectron_service.commands.loading import LoadPlan, LoadReport
@@ -39,6 +46,8 @@ def load(
     ] = None,
     mode: Mode = "gmm",
     samples: Samples = 20,
+    timeout: TimeoutS = None,
+    allow_fewer_samples: AllowFewerSamples = False,
     horizon: Horizon = None,
     model: Annotated[
         str | None, typer.Option(metavar="NAME", help="A model that the service runs.")
@@ -61,7 +70,12 @@ def load(
     from trajectron_client import ForecastOptions
     from trajectron_service.commands.loading import LoadPlan
 
-    options = ForecastOptions(mode=mode, num_samples=samples)
+    options = ForecastOptions(
+        mode=mode,
+        num_samples=samples,
+        deadline_s=timeout,
+        allow_fewer_samples=allow_fewer_samples,
+    )
     if horizon is not None:
         options["horizon"] = horizon
     interval_s = 1.0 / rate

@@ -55,6 +55,19 @@ Sampling = Annotated[
         "same distribution.",
     ),
 ]
+TimeoutS = Annotated[
+    float | None,
+    typer.Option(
+        "--timeout", min=0.001, help="Seconds to answer in; what would be late is refused."
+    ),
+]
+AllowFewerSamples = Annotated[
+    bool,
+    typer.Option(
+        "--allow-fewer-samples",
+        help="Where all samples would be late: the first ones, as many as are in time.",
+    ),
+]
 FramesPerStep = Annotated[
     int,
     typer.Option(

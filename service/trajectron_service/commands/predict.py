@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trajectron_service.commands.options import (
+    AllowFewerSamples,
     FramesPerStep,
     Horizon,
     Mode,
@@ -16,6 +17,7 @@ from trajectron_service.commands.options import (
     Samples,
     Sampling,
     Seed,
+    TimeoutS,
     out,
 )
 
@@ -52,6 +54,8 @@ def predict(
     horizon: Horizon = None,
     seed: Seed = None,
     sampling: Sampling = "iid",
+    timeout: TimeoutS = None,
+    allow_fewer_samples: AllowFewerSamples = False,
     agents: Annotated[
         str | None, typer.Option(metavar="ID,...", help="Only these agents; all by default.")
     ] = None,
@@ -98,6 +102,8 @@ def predict(
         agents=tuple(agents.split(",")) if agents else None,
         include_modes=None if json and plot is None else True,
         sampling=SamplingChoice(sampling),
+        deadline_s=timeout,
+        allow_fewer_samples=allow_fewer_samples,
     )
     seen = tuple(scenes(recording, first, step + 1))
     forecast = forecast_offline(model, seen, options, recording.dt_s)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from trajectron_service.commands.options import (
+    AllowFewerSamples,
     FramesPerStep,
     Horizon,
     Mode,
@@ -14,6 +15,7 @@ from trajectron_service.commands.options import (
     Samples,
     Sampling,
     Seed,
+    TimeoutS,
 )
 
 
@@ -56,6 +58,8 @@ def replay(
     horizon: Horizon = None,
     seed: Seed = None,
     sampling: Sampling = "iid",
+    timeout: TimeoutS = None,
+    allow_fewer_samples: AllowFewerSamples = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Only the summary, no line for each frame.")
     ] = False,
@@ -97,6 +101,8 @@ def replay(
                 seed=seed,
                 include_modes=True,
                 sampling=sampling,
+                deadline_s=timeout,
+                allow_fewer_samples=allow_fewer_samples,
             ),
         )
     )
