@@ -93,8 +93,10 @@ class Choices:
 
     def type_rules(self, config: SessionConfig) -> TypeRules:
         """How a session reads types."""
-        limits = self.model(config.model).speed_limits_mps
-        return TypeRules(limits, config.unknown_types, config.type_map)
+        facts = self.model(config.model)
+        return TypeRules(
+            facts.speed_limits_mps, facts.radii_m, config.unknown_types, config.type_map
+        )
 
     @property
     def frame_limits(self) -> FrameLimits:
@@ -102,6 +104,7 @@ class Choices:
         return FrameLimits(
             self.settings.max_agents_per_frame,
             self.settings.max_agents_per_scene,
+            self.settings.max_edges_per_frame,
             self.settings.speed_tolerance,
         )
 

@@ -213,7 +213,12 @@ def _facts(loaded: LoadedModel, is_default: bool) -> ModelFacts:
         provenance=loaded.provenance,
         kernels=kernels.in_use(),
     )
-    return ModelFacts(info, {name: config.speed_limit_mps(name) for name in config.node_types})
+    names = config.node_types
+    return ModelFacts(
+        info,
+        {name: config.speed_limit_mps(name) for name in names},
+        {(a, b): config.radius_between_m(a, b) for a in names for b in names},
+    )
 
 
 def _live(states: States, network: Trajectron) -> tuple[PackedScene, ...]:

@@ -21,10 +21,14 @@ States = tuple[State, ...] | bytes
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """What the core needs to know of a loaded model; limits in m/s by type."""
+    """What the core needs to know of a loaded model; limits in m/s by type.
+
+    ``radii_m`` holds the distance up to which two agents are joined, for each pair of types.
+    """
 
     info: ModelInfo
     speed_limits_mps: Mapping[str, float]
+    radii_m: Mapping[tuple[str, str], float]
 
 
 @dataclass(frozen=True, eq=False)

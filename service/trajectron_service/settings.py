@@ -58,6 +58,9 @@ class Settings(BaseSettings):
     max_agents_per_scene: Count = Field(
         4000, description="Agents in a scene, those missing but not timed out included."
     )
+    max_edges_per_frame: Count = Field(
+        500_000, description="Pairs of agents in one frame that are near each other, counted twice."
+    )
     max_frames_per_request: Count = Field(1000, description="Frames in one request.")
     max_samples: int = Field(SAMPLES_BOUND, ge=1, le=SAMPLES_BOUND, description="Samples asked.")
     max_horizon: int = Field(HORIZON_BOUND, ge=1, le=HORIZON_BOUND, description="Steps asked.")

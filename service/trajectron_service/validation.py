@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from trajectron_service.errors import FieldViolation
 from trajectron_service.messages import Agent, Frame, UnknownTypes
@@ -28,9 +29,13 @@ _SHOWN_LENGTH = 64
 
 @dataclass(frozen=True)
 class TypeRules:
-    """The model's types with their speed limits in m/s, and what happens to any other type."""
+    """The model's types with their speed limits in m/s, and what happens to any other type.
+
+    ``radii_m``: see ``ModelFacts``.
+    """
 
     speed_limits_mps: Mapping[str, float]
+    radii_m: Mapping[tuple[str, str], float]
     unknown_types: UnknownTypes
     type_map: Mapping[str, str]
 
@@ -49,6 +54,7 @@ class FrameLimits:
 
     max_agents_per_frame: int
     max_agents_per_scene: int
+    max_edges_per_frame: int
     speed_tolerance: float
 
 
@@ -88,6 +94,7 @@ def check(
         observation, ignored = _observation(time_s, frame.agents, rules)
         _scene_size(observation, timeline, limits)
         _speeds(frame.agents, observation, timeline, rules, limits)
+        _edges(observation, rules, limits)
     except _Fault as fault:
         return fault.violation
     return Checked(observation, ignored)
@@ -226,6 +233,25 @@ def _speeds(
                 f"{quoted(agent)} moved {distance_m:.1f} m in {elapsed_s:.3g} s, faster than a "
                 f"{kind} can ({bound_mps:.1f} m/s); check units, ids and times",
             )
+
+
+def _edges(observation: Observation, rules: TypeRules, limits: FrameLimits) -> None:
+    """Refuses a frame whose graph would be too large: counted by k-d trees, never listed."""
+    agents = len(observation.ids)
+    if agents * (agents - 1) <= limits.max_edges_per_frame:
+        return
+    kinds = np.array(observation.types)
+    trees = {name: cKDTree(observation.positions[kinds == name]) for name in set(kinds.tolist())}
+    edges = -agents  # everybody is near oneself
+    for a, of_a in trees.items():
+        for b, of_b in trees.items():
+            edges += int(of_a.count_neighbors(of_b, rules.radii_m[a, b]))
+    if edges > limits.max_edges_per_frame:
+        raise _Fault(
+            "agents",
+            f"{agents} agents so close together make {edges} edges; a frame may have at most "
+            f"{limits.max_edges_per_frame}: check units, or send fewer agents",
+        )
 
 
 def _distance(last: Seen, place: list[float]) -> float:

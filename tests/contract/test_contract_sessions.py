@@ -385,3 +385,14 @@ async def test_a_client_is_told_what_became_of_its_session(driver: Driver) -> No
             await driver.get_session(name)
         assert caught.value.kind == "UNKNOWN_SESSION"
         assert words in caught.value.message
+
+
+async def test_a_crowd_in_one_spot_is_refused_and_changes_nothing(driver: Driver) -> None:
+    async with session(driver, walking(3)) as name:
+        before = await picture(driver, name)
+        spot = frame(3 * DT_S, *(agent(f"a{k}", 0.0) for k in range(800)))
+        async with refused(driver, "INVALID_ARGUMENT") as caught:
+            await driver.observe(name, [spot])
+        assert caught.value.fields == ("frames[0].agents",)
+        assert "639200 edges" in caught.value.message
+        assert await picture(driver, name) == before

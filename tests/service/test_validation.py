@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 from tests.service.building import frame, observation
 
+from trajectron_model.graph import find_edges
 from trajectron_service.errors import FieldViolation
 from trajectron_service.messages import Agent, Frame, UnknownTypes
 from trajectron_service.timebase import Grid, Timeline, advance
 from trajectron_service.validation import Checked, FrameLimits, TypeRules, check, quoted
 
 EMPTY = Timeline(Grid.of(0.4, None, 2.0))
-LIMITS = FrameLimits(max_agents_per_frame=2000, max_agents_per_scene=4000, speed_tolerance=1.5)
+LIMITS = FrameLimits(
+    max_agents_per_frame=2000,
+    max_agents_per_scene=4000,
+    max_edges_per_frame=500_000,
+    speed_tolerance=1.5,
+)
+RADII_M = {
+    ("pedestrian", "pedestrian"): 3.0,
+    ("pedestrian", "pillar"): 2.0,
+    ("pillar", "pedestrian"): 2.0,
+    ("pillar", "pillar"): 1.0,
+}
 
 
 def rules(policy: UnknownTypes = UnknownTypes.REJECT, **type_map: str) -> TypeRules:
-    return TypeRules({"pedestrian": 10.0, "pillar": 0.0}, policy, type_map)
+    return TypeRules({"pedestrian": 10.0, "pillar": 0.0}, RADII_M, policy, type_map)
 
 
 def person(name: str = "7", x: float | None = 1.0, y: float | None = 2.0) -> Agent:
@@ -126,11 +140,43 @@ def test_what_cannot_move_may_still_tremble() -> None:
 
 
 def test_a_scene_has_a_largest_size_though_each_frame_is_small() -> None:
-    limits = FrameLimits(max_agents_per_frame=2, max_agents_per_scene=3, speed_tolerance=1.5)
+    limits = dataclasses.replace(LIMITS, max_agents_per_frame=2, max_agents_per_scene=3)
     seen = advance(EMPTY, observation(0.0, a=(0.0, 0.0), b=(1.0, 0.0))).timeline
     assert isinstance(check(frame(0.4, b=(1.0, 0.0), c=(2.0, 0.0)), seen, rules(), limits), Checked)
     found = fault(frame(0.4, c=(2.0, 0.0), d=(3.0, 0.0)), seen, limits)
     assert (found.field, "4 agents" in found.description) == ("agents", True)
+
+
+def crowd(size_m: float) -> Frame:
+    places = np.random.default_rng(3).uniform(0.0, size_m, size=(60, 2)).tolist()
+    kinds = ["pedestrian", "pillar"] * 30
+    rows = zip(kinds, places, strict=True)
+    return Frame(0.0, tuple(Agent(str(k), kind, x, y) for k, (kind, (x, y)) in enumerate(rows)))
+
+
+@pytest.mark.parametrize("size_m", [0.5, 6.0, 20.0])
+def test_a_frame_may_have_as_many_edges_as_its_limit_and_not_one_more(size_m: float) -> None:
+    one = crowd(size_m)
+    names = ("pedestrian", "pillar")
+    receiver, _ = find_edges(
+        passed(one).observation.positions,
+        np.ones(60, dtype=bool),
+        np.array([0, 1] * 30),
+        np.zeros(60, dtype=np.int64),
+        np.array([[RADII_M[a, b] for b in names] for a in names]),
+    )
+    edges = len(receiver)
+    assert edges > 0
+    just = dataclasses.replace(LIMITS, max_edges_per_frame=edges)
+    assert isinstance(check(one, EMPTY, rules(), just), Checked)
+    found = fault(one, limits=dataclasses.replace(LIMITS, max_edges_per_frame=edges - 1))
+    assert found.field == "agents"
+    assert f"make {edges} edges" in found.description
+
+
+def test_two_thousand_agents_in_one_spot_are_refused() -> None:
+    spot = Frame(0.0, tuple(Agent(str(k), "pedestrian", 0.0, 0.0) for k in range(2000)))
+    assert "3998000 edges" in fault(spot).description
 
 
 def test_messages_show_a_clients_text_escaped_and_short() -> None:
