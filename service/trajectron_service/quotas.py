@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Annotated
 
@@ -38,7 +38,7 @@ class Quotas(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     sessions: _Count | None = Field(None, description="Open sessions.")
-    streams: _Count | None = Field(None, description="Open streams.")
+    streams: _Count | None = Field(None, description="Open streams, and evaluations watched.")
     evaluations: _Count | None = Field(None, description="Evaluations kept.")
     evaluations_active: _Count | None = Field(None, description="Evaluations queued or running.")
     requests_per_s: _PerSecond | None = Field(None, description="Calls; a stream is one.")
@@ -100,7 +100,7 @@ class Usage:
         self._metrics = metrics
         self._clock = clock
         self._buckets: dict[tuple[str, Rate], _Bucket] = {}
-        self._streams: dict[str, Counter[str]] = {}  # by tenant, of each session
+        self._streams: dict[str, Counter[Hashable]] = {}  # by tenant, of each subject
         self._labels: set[str] = set()
 
     def limit(self, limit: Limit) -> int | None:
@@ -129,23 +129,26 @@ class Usage:
         )
 
     @contextmanager
-    def stream(self, session_id: str) -> Iterator[None]:
+    def stream(self, subject: Hashable) -> Iterator[None]:
         """Counts a stream for the length of the block; one that takes over another is not one more.
+
+        Args:
+            subject: what one stream at a time has, such as the id of a session.
 
         Raises:
             ServiceError: TOO_MANY_STREAMS.
         """
         tenant = tenancy.current()
         streams = self._streams.setdefault(tenant, Counter())
-        if session_id not in streams:
+        if subject not in streams:
             self.check(Limit.STREAMS, len(streams))
-        streams[session_id] += 1
+        streams[subject] += 1
         try:
             yield
         finally:
-            streams[session_id] -= 1
-            if not streams[session_id]:
-                del streams[session_id]
+            streams[subject] -= 1
+            if not streams[subject]:
+                del streams[subject]
 
     def take(self, rate: Rate, amount: float = 1.0) -> None:
         """Takes an amount from what the tenant may ask for.

@@ -20,6 +20,7 @@ from tests.contract.drivers import (
     RefusalError,
     frame_message,
     grpc_refusal,
+    http_refusal,
     options_message,
     status_refusal,
 )
@@ -33,6 +34,8 @@ from tests.contract.scenes import walking
 from tests.contract.servers import small_settings
 
 from trajectron_client import Access, Agent, AsyncClient, Frame, RateLimitedError
+from trajectron_proto.v1 import evaluation_pb2 as epb
+from trajectron_proto.v1 import evaluation_pb2_grpc
 from trajectron_proto.v1 import trajectron_pb2 as pb
 from trajectron_service.evaluations import jobs, queue
 from trajectron_service.lifecycle import Service, running
@@ -249,6 +252,64 @@ async def test_points_beyond_the_rate_are_refused(place: Place, transport: str) 
             refused(told.value, "RATE_LIMITED", transport)
             assert "agents x samples x steps" in told.value.message
         assert (await ann.get_session("s"))["version"] == 2
+
+
+@both
+async def test_watching_counts_as_a_stream(
+    place: Place, transport: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def forever(*_: Any) -> None:
+        await asyncio.Event().wait()
+
+    async def readable(*_: Any) -> None:
+        pass
+
+    monkeypatch.setattr(queue, "carry_out", forever)
+    monkeypatch.setattr(jobs, "check_recordings", readable)
+    place.quotas(streams=1)
+    async with over(place, transport, "ann") as (_, ann):
+        asked: Any = {"models": ["constant-velocity"]}
+        await ann.create({"square.csv": walkers()}, evaluation_id="a", **asked)
+        async with watching(place, transport, "ann") as events:
+            assert await anext(events)
+            with pytest.raises(RefusalError) as told:
+                async with watching(place, transport, "anns other") as others:
+                    await anext(others)
+        refused(told.value, "TOO_MANY_STREAMS", transport)
+        async with asyncio.timeout(30):
+            while place.service.admission._usage._streams["ann"]:  # noqa: ASYNC110  the server's time
+                await asyncio.sleep(0.01)
+        async with watching(place, transport, "anns other") as events:
+            assert await anext(events)
+        await ann.delete("a")
+
+
+@asynccontextmanager
+async def watching(place: Place, transport: str, name: str) -> AsyncIterator[AsyncIterator[Any]]:
+    """What comes while evaluation ``a`` is watched; raises ``RefusalError``."""
+    service = place.service
+    if transport == "http":
+        headers = {"Authorization": f"Bearer {TOKENS[name]}"}
+        url = f"http://127.0.0.1:{service.http_port}/v1/evaluations/a:watch"
+        async with (
+            httpx.AsyncClient(headers=headers, timeout=30.0) as http,
+            http.stream("GET", url) as answer,
+        ):
+            if answer.is_error:
+                await answer.aread()
+                raise http_refusal(answer)
+            yield answer.aiter_lines()
+        return
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{service.grpc_port}") as channel:
+        asked = epb.WatchEvaluationRequest(evaluation_id="a")
+        stub: Any = evaluation_pb2_grpc.EvaluationServiceStub(channel)
+        call = stub.WatchEvaluation(asked, metadata=metadata(name), timeout=30)
+        try:
+            yield aiter(call)
+        except grpc.aio.AioRpcError as error:
+            raise grpc_refusal(error) from None
+        finally:
+            call.cancel()
 
 
 @both

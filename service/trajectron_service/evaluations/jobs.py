@@ -11,6 +11,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from contextlib import ExitStack
 
 from trajectron_service import pages, tenancy
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
@@ -219,19 +220,21 @@ class Evaluations:
 
         What changes twice before it is asked for is given once.
         """
-        with self._work.taken():
-            job = self._job(identity)
-        while True:
-            # Read before it is given: it may change while a slow reader takes its time.
-            changed, info = job.changed, job.info
-            if job.removed:
-                raise _unknown(identity)
-            yield info
-            if info.state.ended:
-                return
-            if self._work.draining:
-                raise stopping()
-            await changed.wait()
+        with ExitStack() as counted:
+            with self._work.taken():
+                job = self._job(identity)
+                counted.enter_context(self._usage.stream(object()))
+            while True:
+                # Read before it is given: it may change while a slow reader takes its time.
+                changed, info = job.changed, job.info
+                if job.removed:
+                    raise _unknown(identity)
+                yield info
+                if info.state.ended:
+                    return
+                if self._work.draining:
+                    raise stopping()
+                await changed.wait()
 
     async def cancel(self, identity: str) -> EvaluationInfo:
         """Ends an evaluation; one that has ended stays as it is."""
