@@ -53,10 +53,15 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         services: their full names, such as ``trajectron.v1.TrajectronService``.
         metrics: where durations and stages go.
         admission: who is let in.
+        max_calls: at once; more are refused.
     """
 
-    def __init__(self, services: Sequence[str], metrics: Metrics, admission: Admission) -> None:
+    def __init__(
+        self, services: Sequence[str], metrics: Metrics, admission: Admission, max_calls: int
+    ) -> None:
         self._admission = admission
+        self._max_calls = max_calls
+        self._calls = 0
         self._services = frozenset(services)
         self._metrics = metrics
 
@@ -115,6 +120,13 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         return call
 
     def _admit(self, method: str, context: Context) -> None:
+        if self._calls > self._max_calls:
+            self._metrics.refusals.labels(ErrorKind.OVERLOADED.value).inc()
+            raise ServiceError(
+                ErrorKind.OVERLOADED,
+                f"{self._max_calls} calls are open, the most that there may be; try again later",
+                retry_after_s=1.0,
+            )
         given = dict(context.invocation_metadata() or ()).get("authorization")
         text = given.decode("latin-1") if isinstance(given, bytes) else given
         self._admission.admit(text, scope_of_rpc(method))
@@ -129,12 +141,14 @@ class GrpcInterceptor(grpc.aio.ServerInterceptor):
         call = self._metrics.tracing.call("grpc", method, carried)
         record = _Record(method, call.traceparent)
         start = time.perf_counter()
+        self._calls += 1
         try:
             yield record
         except (asyncio.CancelledError, GeneratorExit):
             record.code = grpc.StatusCode.CANCELLED.name
             raise
         finally:
+            self._calls -= 1
             duration_s = time.perf_counter() - start
             self._metrics.request("grpc", method, record.code, duration_s)
             call.end(method, record.code, failed=record.code in _FAULTS)

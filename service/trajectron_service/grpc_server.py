@@ -33,6 +33,9 @@ _SHORTEST_PING_MS = 5_000
 # We look for dead peers once a minute, and give them 20 s.
 _KEEPALIVE_MS = 60_000
 _KEEPALIVE_TIMEOUT_MS = 20_000
+# A connection has so long to say that it speaks gRPC, and is closed after so long without a call.
+_HANDSHAKE_MS = 20_000
+_IDLE_MS = 600_000
 
 
 def grpc_server(
@@ -54,7 +57,8 @@ def grpc_server(
         settings: the limits of messages.
     """
     server = grpc.aio.server(
-        interceptors=[GrpcInterceptor(SERVICES, metrics, admission)], options=_options(settings)
+        interceptors=[GrpcInterceptor(SERVICES, metrics, admission, settings.max_calls)],
+        options=_options(settings),
     )
     trajectron_pb2_grpc.add_TrajectronServiceServicer_to_server(GrpcApi(application), server)
     evaluation_pb2_grpc.add_EvaluationServiceServicer_to_server(
@@ -78,6 +82,9 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.http2.min_ping_interval_without_data_ms", _SHORTEST_PING_MS),
         # While such a probe is on its way no keepalive is sent, and a dead peer is never noticed.
         ("grpc.http2.bdp_probe", 0),
+        ("grpc.max_concurrent_streams", settings.max_calls),
+        ("grpc.server_handshake_timeout_ms", _HANDSHAKE_MS),
+        ("grpc.max_connection_idle_ms", _IDLE_MS),
         # Otherwise a second server would share the port, and half of the calls, unnoticed.
         ("grpc.so_reuseport", 0),
     ]

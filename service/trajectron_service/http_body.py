@@ -23,6 +23,32 @@ B = TypeVar("B", bound=Body)
 T = TypeVar("T")
 
 
+class Arriving:
+    """Bytes of bodies that are being received, all requests together.
+
+    Args:
+        limit_bytes: at most so many; not less than one body may have.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit = limit_bytes
+        self._held = 0
+
+    def take(self, size: int) -> None:
+        """Counts more bytes in; raises ``OVERLOADED`` where that would be too many."""
+        if self._held + size > self._limit:
+            raise ServiceError(
+                ErrorKind.OVERLOADED,
+                "the service is receiving too much at once; try again later",
+                retry_after_s=1.0,
+            )
+        self._held += size
+
+    def give_back(self, size: int) -> None:
+        """Counts bytes out again."""
+        self._held -= size
+
+
 async def read_body(request: Request, shape: type[B], limit_bytes: int) -> B:
     """A request's body in its shape; an empty one is an empty object.
 
@@ -50,7 +76,7 @@ def parse_body(raw: bytes, shape: type[B]) -> B:
 
 
 async def read_raw(request: Request, limit_bytes: int) -> bytes:
-    """A request's body as it is; raises as ``read_body`` does."""
+    """A request's body as it is; raises as ``read_body`` does, and ``OVERLOADED``."""
     if request.headers.get("content-encoding", "identity") != "identity":
         raise ServiceError(ErrorKind.MALFORMED, "the body has a Content-Encoding; send it as it is")
     announced = request.headers.get("content-length", "0")
@@ -65,16 +91,22 @@ async def read_raw(request: Request, limit_bytes: int) -> bytes:
 
 
 async def _collect(request: Request, limit_bytes: int) -> bytes:
+    arriving: Arriving = request.app.state.arriving
     chunks: list[bytes] = []
-    size = 0
-    async for chunk in request.stream():
-        size += len(chunk)
-        if size <= limit_bytes:
-            chunks.append(chunk)
-        elif size > limit_bytes * _PATIENCE:
-            break
-        else:
-            chunks.clear()
+    size = held = 0
+    try:
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size <= limit_bytes:
+                arriving.take(len(chunk))
+                held += len(chunk)
+                chunks.append(chunk)
+            elif size > limit_bytes * _PATIENCE:
+                break
+            else:
+                chunks.clear()
+    finally:
+        arriving.give_back(held)
     if size > limit_bytes:
         raise _too_large(limit_bytes)
     return b"".join(chunks)

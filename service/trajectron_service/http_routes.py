@@ -15,6 +15,7 @@ from trajectron_service.errors import ServiceError
 from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.health import Health, Phase
 from trajectron_service.http_api import HttpApi, json_response
+from trajectron_service.http_body import Arriving
 from trajectron_service.http_docs import BINARY, add_docs, errors, takes
 from trajectron_service.http_evaluation_routes import evaluation_routes
 from trajectron_service.http_evaluations import HttpEvaluations
@@ -36,6 +37,7 @@ def http_app(
     admission: Admission,
     *,
     max_body_bytes: int,
+    max_arriving_bytes: int,
     version: str,
 ) -> FastAPI:
     """Everything that is served over HTTP.
@@ -47,10 +49,12 @@ def http_app(
         metrics: what ``/metrics`` tells.
         admission: who is let in.
         max_body_bytes: larger bodies are refused while they are read.
+        max_arriving_bytes: of all bodies being read; more are refused, too.
         version: of the distribution, for the OpenAPI page.
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
     app.state.metrics = metrics
+    app.state.arriving = Arriving(max(max_arriving_bytes, max_body_bytes))
     app.add_middleware(RequestMiddleware, metrics=metrics, admission=admission)
     app.add_exception_handler(ServiceError, http_errors.on_service_error)
     app.add_exception_handler(HTTPException, http_errors.on_http_exception)

@@ -23,16 +23,21 @@ class HttpServer:
     Args:
         app: what answers.
         listener: bound, not yet listening; it is closed at the end.
+        protocol: what speaks HTTP: `http_connections.bounded_protocol`.
         tls: plain text when None.
     """
 
     def __init__(
-        self, app: ASGIApp, listener: socket.socket, tls: ssl.SSLContext | None = None
+        self,
+        app: ASGIApp,
+        listener: socket.socket,
+        protocol: type[asyncio.Protocol],
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self._listener = listener
         config = uvicorn.Config(
             app,
-            http="h11",
+            http=protocol,
             ws="none",
             lifespan="off",
             log_config=None,

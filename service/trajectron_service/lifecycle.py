@@ -23,6 +23,7 @@ from trajectron_service.application import Application
 from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.grpc_server import SERVICES, grpc_server
 from trajectron_service.health import Health
+from trajectron_service.http_connections import ConnectionLimits, bounded_protocol
 from trajectron_service.http_routes import http_app
 from trajectron_service.http_server import HttpServer, listen
 from trajectron_service.metrics import Metrics
@@ -152,9 +153,13 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
                 metrics,
                 admission,
                 max_body_bytes=settings.max_message_bytes,
+                max_arriving_bytes=settings.max_arriving_bytes,
                 version=version(),
             ),
             listener,
+            bounded_protocol(
+                ConnectionLimits(settings.max_connections, settings.receive_timeout_s), metrics
+            ),
             tls.http if tls else None,
         )
         await calls.start()

@@ -201,6 +201,16 @@ class Metrics:
             ("kind",),
             registry=registry,
         )
+        self.http_connections = Gauge(
+            "trajectron_http_connections", "Open HTTP connections.", registry=registry
+        )
+        self.connections_cut = Counter(
+            "trajectron_http_connections_cut",
+            "HTTP connections ended by the service: too_many, slow_request (it did not arrive "
+            "whole in time), slow_reader (its answer did not move).",
+            ("reason",),
+            registry=registry,
+        )
         self.quota_refusals = Counter(
             "trajectron_quota_refusals",
             "Calls, frames and forecasts beyond a tenant's quota: refused, or, frames of streams, "

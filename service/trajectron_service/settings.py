@@ -73,6 +73,19 @@ class Settings(BaseSettings):
         16 * 2**20, description="Size of an HTTP body and of a gRPC message received."
     )
     max_reply_bytes: Count = Field(256 * 2**20, description="Size of a gRPC message sent.")
+    max_connections: Count = Field(
+        1000, description="HTTP connections at once; more are told 503 and closed."
+    )
+    max_calls: Count = Field(
+        4096, description="gRPC calls at once, streams included; more are refused."
+    )
+    max_arriving_bytes: Count = Field(
+        256 * 2**20, description="HTTP bodies being received, all together; more are refused."
+    )
+    receive_timeout_s: Seconds = Field(
+        30.0,
+        description="Time for an HTTP request to arrive whole, and for an answer to move at all.",
+    )
 
     queue_size: Count = Field(1024, description="Work waiting for the model; more is refused.")
     max_batch_points: Count = Field(
