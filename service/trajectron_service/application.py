@@ -439,9 +439,7 @@ class Application:
     async def _keep_house(self) -> None:
         """Closes sessions that have expired and parks those unused, until cancelled."""
         while True:
-            due = time.monotonic() + HOUSEKEEPING_S
             await asyncio.sleep(HOUSEKEEPING_S)
-            self._metrics.loop_lag.set(max(0.0, time.monotonic() - due))
             try:
                 await self.keep_house()
             except (ServiceError, StoreError) as error:

@@ -18,6 +18,7 @@ from pydantic.json_schema import models_json_schema
 from starlette.responses import RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 
+from trajectron_service.access import OPEN, scope_of_path
 from trajectron_service.errors import ErrorKind, ServiceError, invalid
 from trajectron_service.http_api import PROTOBUF
 from trajectron_service.http_errors import PROBLEM_JSON, Problem, problem_of
@@ -48,6 +49,8 @@ _RETRY_AFTER = {
 }
 _ERRORS: dict[int, str] = {
     400: "The body is not valid JSON.",
+    401: "Where the service asks for tokens: there is none, or none in force.",
+    403: "The token has not the scope that this call needs.",
     404: "No such session, evaluation, model or agent, as `reason` says.",
     409: "The state of the session or evaluation forbids it: `reason` is SESSION_EXISTS, "
     "FRAME_CONFLICT, FRAME_OUT_OF_ORDER, NO_FRAMES, EVALUATION_EXISTS, EVALUATION_HAS_NO_RESULT "
@@ -61,6 +64,12 @@ _ERRORS: dict[int, str] = {
     504: "Not done before the deadline.",
 }
 _EXAMPLES: tuple[ServiceError, ...] = (
+    ServiceError(
+        ErrorKind.UNAUTHENTICATED, "a valid token is required: send `authorization: Bearer TOKEN`"
+    ),
+    ServiceError(
+        ErrorKind.PERMISSION_DENIED, "this token has no scope evaluate, which the call needs"
+    ),
     ServiceError(
         ErrorKind.MALFORMED, "the body is not valid JSON: expected value at line 1 column 1"
     ),
@@ -152,7 +161,29 @@ def _describe(app: FastAPI, version: str) -> dict[str, Any]:
     schemas = description.setdefault("components", {}).setdefault("schemas", {})
     for name, schema in definitions["$defs"].items():
         schemas.setdefault(name, schema)
+    _describe_access(description)
     return description
+
+
+def _describe_access(description: dict[str, Any]) -> None:
+    """Adds the token, and the refusals for want of one, to every call that may need it."""
+    description["components"]["securitySchemes"] = {
+        "token": {
+            "type": "http",
+            "scheme": "bearer",
+            "description": "From `trajectron token new`. Needed where the operator set `tokens`.",
+        }
+    }
+    refusals = {str(status): answer for status, answer in errors(401, 403, 429).items()}
+    for path, calls in description["paths"].items():
+        scope = scope_of_path(path)
+        if scope is OPEN:
+            continue
+        for call in calls.values():
+            call["security"] = [{"token": []}, {}]
+            call["description"] = f"{call.get('description', '')}\n\nScope: `{scope.value}`."
+            for status, answer in refusals.items():
+                call["responses"].setdefault(status, answer)
 
 
 async def _page() -> Response:

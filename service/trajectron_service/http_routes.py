@@ -38,6 +38,7 @@ def http_app(
     *,
     max_body_bytes: int,
     max_arriving_bytes: int,
+    metrics_here: bool,
     version: str,
 ) -> FastAPI:
     """Everything that is served over HTTP.
@@ -50,9 +51,10 @@ def http_app(
         admission: who is let in.
         max_body_bytes: larger bodies are refused while they are read.
         max_arriving_bytes: of all bodies being read; more are refused, too.
+        metrics_here: whether ``/metrics`` is among it; else `operations_app` has it.
         version: of the distribution, for the OpenAPI page.
     """
-    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
+    app = _bare_app()
     app.state.metrics = metrics
     app.state.arriving = Arriving(max(max_arriving_bytes, max_body_bytes))
     app.add_middleware(RequestMiddleware, metrics=metrics, admission=admission)
@@ -63,9 +65,23 @@ def http_app(
     app.include_router(_predictions(api))
     app.include_router(_sessions(api))
     app.include_router(evaluation_routes(HttpEvaluations(evaluations, max_body_bytes)))
-    app.include_router(_operations(health, metrics))
+    app.include_router(_probes(health))
+    if metrics_here:
+        app.include_router(_measurements(metrics))
     add_docs(app, version)
     return app
+
+
+def operations_app(health: Health, metrics: Metrics) -> FastAPI:
+    """Metrics and probes alone, for a port of their own: nobody is asked who they are."""
+    app = _bare_app()
+    app.include_router(_probes(health))
+    app.include_router(_measurements(metrics))
+    return app
+
+
+def _bare_app() -> FastAPI:
+    return FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
 
 
 def _predictions(api: HttpApi) -> APIRouter:
@@ -156,7 +172,7 @@ def _sessions(api: HttpApi) -> APIRouter:
     return router
 
 
-def _operations(health: Health, metrics: Metrics) -> APIRouter:
+def _probes(health: Health) -> APIRouter:
     router = APIRouter(tags=["operations"])
 
     @router.get(
@@ -178,6 +194,12 @@ def _operations(health: Health, metrics: Metrics) -> APIRouter:
         ready = health.phase is Phase.READY
         status = "ok" if ready else health.phase.value
         return json_response({"status": status}, 200 if ready else 503)
+
+    return router
+
+
+def _measurements(metrics: Metrics) -> APIRouter:
+    router = APIRouter(tags=["operations"])
 
     @router.get("/metrics", summary="Metrics", operation_id="metrics", response_class=Response)
     async def measurements() -> Response:

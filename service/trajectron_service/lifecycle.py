@@ -24,8 +24,9 @@ from trajectron_service.evaluations.jobs import Evaluations
 from trajectron_service.grpc_server import SERVICES, grpc_server
 from trajectron_service.health import Health
 from trajectron_service.http_connections import ConnectionLimits, bounded_protocol
-from trajectron_service.http_routes import http_app
+from trajectron_service.http_routes import http_app, operations_app
 from trajectron_service.http_server import HttpServer, listen
+from trajectron_service.lag import measure_lag
 from trajectron_service.metrics import Metrics
 from trajectron_service.protection import check_exposure, load_tls
 from trajectron_service.quotas import Usage, unlimited
@@ -60,6 +61,7 @@ class Service:
     admission: Admission
     http_port: int
     grpc_port: int
+    metrics_port: int | None
 
 
 def serve(settings: Settings) -> None:
@@ -91,6 +93,7 @@ async def _serve(settings: Settings) -> None:
                 host=settings.host,
                 http_port=service.http_port,
                 grpc_port=service.grpc_port,
+                metrics_port=service.metrics_port or service.http_port,
                 store=service.store.kind,
                 durability=service.store.durability.value,
                 models=[model.name for model in service.application.list_models()],
@@ -145,6 +148,9 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
                 if tls
                 else calls.add_insecure_port(address)
             )
+        protocol = bounded_protocol(
+            ConnectionLimits(settings.max_connections, settings.receive_timeout_s), metrics
+        )
         pages = HttpServer(
             http_app(
                 application,
@@ -154,27 +160,45 @@ async def running(settings: Settings, tracing: Tracing | None = None) -> AsyncIt
                 admission,
                 max_body_bytes=settings.max_message_bytes,
                 max_arriving_bytes=settings.max_arriving_bytes,
+                metrics_here=settings.metrics_port is None,
                 version=version(),
             ),
             listener,
-            bounded_protocol(
-                ConnectionLimits(settings.max_connections, settings.receive_timeout_s), metrics
-            ),
+            protocol,
             tls.http if tls else None,
         )
+        metrics_port = None
+        if settings.metrics_port is not None:
+            with _port("metrics_port", settings.metrics_host, settings.metrics_port):
+                own = stack.enter_context(listen(settings.metrics_host, settings.metrics_port))
+            metrics_port = own.getsockname()[1]
+            operations = HttpServer(operations_app(health, metrics), own, protocol)
+            await operations.start()
+            stack.push_async_callback(operations.stop)
         await calls.start()
         stack.push_async_callback(calls.stop, _LAST_BYTES_S)
         await pages.start()
         stack.push_async_callback(pages.stop)
         stack.push_async_callback(_drain, application, evaluations, health, settings.drain_grace_s)
-        watch = asyncio.create_task(admission.keep_watch(), name="tokens")
-        stack.callback(watch.cancel)
+        for watch, name in (
+            (admission.keep_watch(), "tokens"),
+            (measure_lag(metrics.loop_lag), "lag"),
+        ):
+            stack.callback(asyncio.create_task(watch, name=name).cancel)
         await application.start()
         await evaluations.start()
         await health.ready()
         http_port = listener.getsockname()[1]
         yield Service(
-            application, evaluations, health, metrics, store, admission, http_port, grpc_port
+            application,
+            evaluations,
+            health,
+            metrics,
+            store,
+            admission,
+            http_port,
+            grpc_port,
+            metrics_port,
         )
 
 

@@ -283,10 +283,11 @@ class Metrics:
             "Edges, present and fading, in the sessions held in memory.",
             registry=registry,
         )
-        self.loop_lag = Gauge(
+        self.loop_lag = Histogram(
             "trajectron_event_loop_lag_seconds",
-            "How late the last round of housekeeping began, due each second: something blocks the "
-            "event loop where this is long.",
+            "How much later than due sleeps of 20 ms end: something blocks the event loop where "
+            "this is long, and everybody waits.",
+            buckets=SECONDS,
             registry=registry,
         )
         self.queue_length = Gauge(

@@ -45,6 +45,15 @@ class Settings(BaseSettings):
     http_port: Port = Field(8000, description="HTTP port; 0 picks a free one.")
     grpc_port: Port = Field(50051, description="gRPC port; 0 picks a free one.")
 
+    metrics_port: Port | None = Field(
+        None,
+        description="Port of `/metrics`, `/healthz` and `/readyz` alone, in plain text and without "
+        "tokens; 0 picks a free one. Unset: metrics are on the HTTP port.",
+    )
+    metrics_host: str = Field(
+        "127.0.0.1", description="Address that `metrics_port` binds; loopback unless told."
+    )
+
     models: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="Models to load: bundled names or paths; none loads the default model."
     )

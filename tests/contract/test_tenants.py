@@ -183,7 +183,8 @@ async def test_every_route_declares_a_scope(place: Place) -> None:
     service = place.service
     app = http_app(
         service.application, service.evaluations, service.health, service.metrics,
-        service.admission, max_body_bytes=1, max_arriving_bytes=1, version="0",
+        service.admission, max_body_bytes=1, max_arriving_bytes=1,
+        metrics_here=True, version="0",
     )  # fmt: skip
     paths = paths_of(app.routes)
     assert {"/metrics", "/docs", "/v1/sessions/{session_id}:observe"} < set(paths)

@@ -33,6 +33,10 @@ def serve(
         int | None,
         typer.Option(min=0, max=65535, help="50051 by default; 0 picks a free one."),
     ] = None,
+    metrics_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Metrics and probes there, not on the HTTP port."),
+    ] = None,
     tokens: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Who may call, see `trajectron token new --help`."),
@@ -71,6 +75,7 @@ def serve(
             host=host,
             http_port=http_port,
             grpc_port=grpc_port,
+            metrics_port=metrics_port,
             tokens=tokens,
             insecure=insecure,
             log_level=log_level,
