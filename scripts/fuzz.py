@@ -4,8 +4,9 @@
 
 HTTP cases are schemathesis's, half of them against the document. gRPC cases are messages of
 random fields, such messages with bytes changed, and random bytes, several at once. No case may
-be answered 500, 501 or 502, INTERNAL, UNKNOWN or UNIMPLEMENTED; the service has to live, its
-memory to stay, and a session that nobody names to stay as it was. Exits 1 otherwise.
+be answered 500, 501 or 502, INTERNAL, UNKNOWN or UNIMPLEMENTED, nor be left without an answer; the
+service has to live, its memory to stay, a session that nobody names to stay as it was, and one
+that is named to change by no call that is refused. Exits 1 otherwise.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import random
 import sys
 import tempfile
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -38,9 +40,13 @@ from trajectron_client import Client, Frame
 from trajectron_proto.v1 import evaluation_pb2, trajectron_pb2
 
 _AT_ONCE = 8
-_TIMEOUT_S = 10.0
+# Four times what the service allows itself: who hears nothing until then is left without an answer.
+_TIMEOUT_S = 20.0
+_HUNG = "no answer"
 _FORBIDDEN_STATUS = {500, 501, 502}
-_FORBIDDEN_CODES = {"INTERNAL", "UNKNOWN", "UNIMPLEMENTED"}
+_FORBIDDEN_CODES = {"INTERNAL", "UNKNOWN", "UNIMPLEMENTED", _HUNG}
+# Cases that name a session, one at a time, between two looks at it.
+_NAMING_SHARE = 0.02
 # schemathesis takes a tenth of a second to think of a case.
 _HTTP_SHARE = 0.1
 # Caches and pools fill in the beginning.
@@ -90,14 +96,12 @@ def main() -> None:
 def _run(arguments: argparse.Namespace, http_port: int, grpc_port: int) -> dict[str, Any]:
     pid = child()
     over_http = int(_HTTP_SHARE * arguments.cases)
-    over_grpc = arguments.cases - over_http
+    naming = int(_NAMING_SHARE * arguments.cases)
+    over_grpc = arguments.cases - over_http - naming
     url, target = f"http://127.0.0.1:{http_port}", f"127.0.0.1:{grpc_port}"
     with Client(target, timeout_s=30.0) as client:
-        session = client.create_session()
-        for step in range(3):
-            places = [(0.4 * step, 0.0), (0.0, 0.5 * step)]
-            client.observe(session.id, Frame.from_arrays(0.4 * step, ["a", "b"], places))
-        before = client.get_session(session.id)
+        session, named = (_walked(client) for _ in range(2))
+        before = client.get_session(session)
     answers = {"http": Counter[str](), "grpc": Counter[str]()}
     faults: list[str] = []
     warm = int(_WARM_UP_SHARE * over_grpc)
@@ -106,8 +110,9 @@ def _run(arguments: argparse.Namespace, http_port: int, grpc_port: int) -> dict[
     resident = resident_bytes(pid)
     asyncio.run(_fuzz_grpc(target, over_grpc - warm, arguments.seed, answers["grpc"], faults))
     growth = resident_bytes(pid) / resident - 1.0
+    refused = _fuzz_named(target, named, naming, arguments.seed, answers["grpc"], faults)
     with Client(target, timeout_s=30.0) as client:
-        after = client.get_session(session.id)
+        after = client.get_session(session)
     untouched = (before.info.version, before.graph) == (after.info.version, after.graph)
     alive = httpx.get(f"{url}/healthz", timeout=30.0).is_success
     return {
@@ -115,10 +120,49 @@ def _run(arguments: argparse.Namespace, http_port: int, grpc_port: int) -> dict[
         "answers": {name: dict(counts.most_common()) for name, counts in answers.items()},
         "memory_growth": growth,
         "session_untouched": untouched,
+        "refused_of_those_naming_a_session": refused,
         "alive": alive,
         "faults": faults[:20],
         "passed": not faults and untouched and alive and growth < _MOST_GROWTH,
     }
+
+
+def _walked(client: Client) -> str:
+    """A session with two agents who have walked three steps."""
+    session = client.create_session()
+    for step in range(3):
+        places = [(0.4 * step, 0.0), (0.0, 0.5 * step)]
+        client.observe(session.id, Frame.from_arrays(0.4 * step, ["a", "b"], places))
+    return session.id
+
+
+def _fuzz_named(
+    target: str, session: str, cases: int, first: int, answers: Counter[str], faults: list[str]
+) -> int:
+    """Calls that name a session: one that is refused leaves it as it was. How many were."""
+    draw = random.Random(first + 2)
+    methods = [
+        method
+        for method in trajectron_pb2.DESCRIPTOR.services_by_name["TrajectronService"].methods
+        if "session_id" in method.input_type.fields_by_name and method.name != "DeleteSession"
+    ]
+    refused = 0
+    with Client(target, timeout_s=30.0) as client, grpc.insecure_channel(target) as channel:
+        for number in range(cases):
+            method = methods[number % len(methods)]
+            message = message_factory.GetMessageClass(method.input_type)()
+            _fill(draw, message, 0)
+            setattr(message, "session_id", session)  # noqa: B010 - known of a descriptor alone
+            before = client.get_session(session)
+            path = f"/{method.containing_service.full_name}/{method.name}"
+            code = _unary(channel.unary_unary(path), message.SerializeToString())
+            after = client.get_session(session)
+            answers[code] += 1
+            refused += code != "OK"
+            changed = (before.info.version, before.graph) != (after.info.version, after.graph)
+            if code in _FORBIDDEN_CODES or (changed and code != "OK"):
+                faults.append(f"{method.full_name}: {code}, changed: {changed}: {message}"[:500])
+    return refused
 
 
 def _fuzz_http(url: str, cases: int, first: int, answers: Counter[str], faults: list[str]) -> None:
@@ -257,6 +301,7 @@ async def _call(
     channel: Any, blocking: Any, method: MethodDescriptor, requests: list[bytes]
 ) -> str:
     path = f"/{method.containing_service.full_name}/{method.name}"
+    began = time.monotonic()
     try:
         async with asyncio.timeout(2.0 * _TIMEOUT_S):
             if method.client_streaming:
@@ -268,9 +313,25 @@ async def _call(
             else:
                 await channel.unary_unary(path)(requests[0], timeout=_TIMEOUT_S)
     except grpc.RpcError as error:
-        return str(error.code().name)
+        return _said(error, began)
     except TimeoutError:
-        return "TIMEOUT"
+        return _HUNG
+    return "OK"
+
+
+def _said(error: Any, began: float) -> str:
+    """The code of a call's end; one that our own deadline made is no answer of the service."""
+    code = str(error.code().name)
+    waited_s = time.monotonic() - began
+    return _HUNG if code == "DEADLINE_EXCEEDED" and waited_s > 0.95 * _TIMEOUT_S else code
+
+
+def _unary(call: Any, request: bytes) -> str:
+    began = time.monotonic()
+    try:
+        call(request, timeout=_TIMEOUT_S)
+    except grpc.RpcError as error:
+        return _said(error, began)
     return "OK"
 
 
@@ -280,11 +341,12 @@ def _stream(call: Any, requests: list[bytes]) -> str:
     By the synchronous API: that of asyncio makes an INTERNAL of its own where it was still
     writing when the server ended the stream.
     """
+    began = time.monotonic()
     try:
         for _ in call(iter(requests), timeout=_TIMEOUT_S):
             pass
     except grpc.RpcError as error:
-        return str(error.code().name)
+        return _said(error, began)
     return "OK"
 
 
