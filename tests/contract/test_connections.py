@@ -7,6 +7,7 @@ import contextlib
 import json
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any, Self
 
 import grpc
 import httpx
@@ -17,6 +18,7 @@ from tests.contract.servers import small_settings
 
 from trajectron_proto.v1 import trajectron_pb2 as pb
 from trajectron_proto.v1.trajectron_pb2_grpc import TrajectronServiceStub
+from trajectron_service import grpc_server
 from trajectron_service.errors import ServiceError
 from trajectron_service.http_body import Arriving
 from trajectron_service.lifecycle import Service, running
@@ -44,6 +46,8 @@ async def service(model_path: Path) -> AsyncIterator[Service]:
         max_calls=CALLS,
     )
     async with running(settings) as service:
+        # The first call of a process blocks the loop, the clients' as well, for some time.
+        assert await answers(service) == 200
         yield service
 
 
@@ -216,6 +220,74 @@ async def test_what_a_body_held_is_given_back() -> None:
     with pytest.raises(ServiceError, match="too much at once"):
         arriving.take(7)
     arriving.take(6)
+
+
+class Tap:
+    """A connection in between that falls silent when told to, without a word to either side."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._silent = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._server: asyncio.Server | None = None
+
+    async def __aenter__(self) -> Self:
+        self._server = await asyncio.start_server(self._join, "127.0.0.1", 0)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._server is not None
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._server.close()
+
+    @property
+    def port(self) -> int:
+        assert self._server is not None
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    def fall_silent(self) -> None:
+        self._silent.set()
+
+    async def _join(self, near: Reader, near_end: Writer) -> None:
+        far, far_end = await asyncio.open_connection("127.0.0.1", self._port)
+        for source, sink in ((near, far_end), (far, near_end)):
+            self._tasks.append(asyncio.create_task(self._carry(source, sink)))
+
+    async def _carry(self, source: Reader, sink: Writer) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await source.read(65536):
+                if not self._silent.is_set():
+                    sink.write(data)
+                    await sink.drain()
+
+
+async def test_a_stream_whose_connection_fell_silent_is_ended_and_what_it_held_is_free(
+    model_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grpc_server, "_KEEPALIVE_MS", 500)
+    monkeypatch.setattr(grpc_server, "_KEEPALIVE_TIMEOUT_MS", 500)
+    opening = pb.StreamPredictRequest(open=pb.StreamOpen(session_id="silent"))
+    async with running(small_settings(model_path)) as service, Tap(service.grpc_port) as tap:
+        streams = service.metrics.streams._value
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{tap.port}") as channel:
+            stream = TrajectronServiceStub(channel).StreamPredict()
+            await stream.write(opening)
+            opened: Any = await stream.read()
+            assert opened.opened.session.id == "silent"
+            assert streams.get() == 1
+            await asyncio.sleep(1.5)  # answers pings: it stays
+            assert streams.get() == 1
+            tap.fall_silent()
+            await _until(lambda: streams.get() == 0)
+            async with grpc.aio.insecure_channel(f"127.0.0.1:{service.grpc_port}") as direct:
+                again = TrajectronServiceStub(direct).StreamPredict()
+                await again.write(opening)
+                opened = await again.read()
+                assert opened.opened.resumed
+                again.cancel()
 
 
 def _open(service: Service) -> float:
