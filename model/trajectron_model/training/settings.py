@@ -65,7 +65,8 @@ class Preset:
 def presets() -> dict[str, Preset]:
     """All presets by name.
 
-    ``default``: the model this project ships, trained on the exact marginal likelihood.
+    ``default``: the model this project ships, trained on the exact marginal likelihood, its
+    weights averaged.
     ``elbo``: the same model on the beta-weighted ELBO. ``paper``: the paper's own inputs
     (raw positions, velocities and accelerations) and radius, on the ELBO. ``traffic``:
     pedestrians, vehicles and cyclists on ApolloScape's 0.5 s grid.
@@ -84,7 +85,7 @@ def presets() -> dict[str, Preset]:
     )
     paper = ModelConfig(features="world", radius_m=1.5)
     return {
-        "default": Preset(ModelConfig(), TrainSettings()),
+        "default": Preset(ModelConfig(), TrainSettings(steps=1800, average_steps=120)),
         "elbo": Preset(ModelConfig(), TrainSettings(objective=elbo)),
         "paper": Preset(paper, TrainSettings(objective=elbo)),
         "traffic": Preset(traffic, TrainSettings(examples=ExampleSettings(agents=96))),
