@@ -60,7 +60,8 @@ class _BoundedProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self.metrics_.http_connections.set(len(self.connections))
+        # Counted up and down: each port has its own connections, and all have this one metric.
+        self.metrics_.http_connections.inc()
         if len(self.connections) > self.limits_.connections:
             self._cut_off("too_many", _FULL)
         else:
@@ -70,7 +71,7 @@ class _BoundedProtocol(H11Protocol):
         self._arrived()
         self._moves()
         super().connection_lost(exc)
-        self.metrics_.http_connections.set(len(self.connections))
+        self.metrics_.http_connections.dec()
 
     def data_received(self, data: bytes) -> None:
         if self._cut:

@@ -202,7 +202,9 @@ class Metrics:
             registry=registry,
         )
         self.http_connections = Gauge(
-            "trajectron_http_connections", "Open HTTP connections.", registry=registry
+            "trajectron_http_connections",
+            "Open HTTP connections, those of the metrics port among them.",
+            registry=registry,
         )
         self.connections_cut = Counter(
             "trajectron_http_connections_cut",

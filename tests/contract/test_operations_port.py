@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import httpx
@@ -36,6 +37,25 @@ async def test_metrics_have_a_port_of_their_own_that_asks_for_no_token(
             assert (await client.get(f"{own}{path}")).status_code == 404, path
         asked = {"authorization": f"Bearer {token}"}
         assert (await client.get(f"{main}/metrics", headers=asked)).status_code == 404
+
+
+async def test_connections_of_all_ports_are_counted_together(model_path: Path) -> None:
+    settings = small_settings(model_path, metrics_port=0)
+    async with running(settings) as service, httpx.AsyncClient(timeout=30.0) as client:
+
+        async def counted(expected: int) -> None:
+            async with asyncio.timeout(30):
+                while True:
+                    page = await client.get(f"http://127.0.0.1:{service.metrics_port}/metrics")
+                    if f"trajectron_http_connections {expected}.0\n" in page.text:
+                        return
+                    await asyncio.sleep(0.01)
+
+        held = [await asyncio.open_connection("127.0.0.1", service.http_port) for _ in range(3)]
+        await counted(3 + 1)  # who asks is one
+        for _, writer in held:
+            writer.close()
+        await counted(1)
 
 
 async def test_metrics_are_on_the_main_port_unless_told(model_path: Path) -> None:
