@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import grpc
 import httpx
@@ -12,6 +14,7 @@ import pytest_asyncio
 from tests.contract.drivers import Driver, GrpcDriver, HttpDriver
 from tests.contract.servers import save_small_model, small_settings
 
+from trajectron_service.evaluations import jobs, queue
 from trajectron_service.lifecycle import Service, running
 from trajectron_service.settings import Settings
 
@@ -69,3 +72,17 @@ def driver(
 def drivers(http: httpx.AsyncClient, channel: grpc.aio.Channel) -> tuple[Driver, Driver]:
     """Both transports, to compare them."""
     return HttpDriver(http), GrpcDriver(channel)
+
+
+@pytest.fixture
+def endless_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluations take any recording and run until they are cancelled."""
+
+    async def forever(*_: Any) -> None:
+        await asyncio.Event().wait()
+
+    async def readable(*_: Any) -> None:
+        pass
+
+    monkeypatch.setattr(queue, "carry_out", forever)
+    monkeypatch.setattr(jobs, "check_recordings", readable)

@@ -37,7 +37,6 @@ from trajectron_client import Access, Agent, AsyncClient, Frame, RateLimitedErro
 from trajectron_proto.v1 import evaluation_pb2 as epb
 from trajectron_proto.v1 import evaluation_pb2_grpc
 from trajectron_proto.v1 import trajectron_pb2 as pb
-from trajectron_service.evaluations import jobs, queue
 from trajectron_service.lifecycle import Service, running
 from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import entry, new_token
@@ -255,17 +254,8 @@ async def test_points_beyond_the_rate_are_refused(place: Place, transport: str) 
 
 
 @both
-async def test_watching_counts_as_a_stream(
-    place: Place, transport: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def forever(*_: Any) -> None:
-        await asyncio.Event().wait()
-
-    async def readable(*_: Any) -> None:
-        pass
-
-    monkeypatch.setattr(queue, "carry_out", forever)
-    monkeypatch.setattr(jobs, "check_recordings", readable)
+@pytest.mark.usefixtures("endless_evaluations")
+async def test_watching_counts_as_a_stream(place: Place, transport: str) -> None:
     place.quotas(streams=1)
     async with over(place, transport, "ann") as (_, ann):
         asked: Any = {"models": ["constant-velocity"]}
@@ -313,17 +303,8 @@ async def watching(place: Place, transport: str, name: str) -> AsyncIterator[Asy
 
 
 @both
-async def test_evaluations_of_a_tenant_are_bounded(
-    place: Place, transport: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def forever(*_: Any) -> None:
-        await asyncio.Event().wait()
-
-    async def readable(*_: Any) -> None:
-        pass
-
-    monkeypatch.setattr(queue, "carry_out", forever)
-    monkeypatch.setattr(jobs, "check_recordings", readable)
+@pytest.mark.usefixtures("endless_evaluations")
+async def test_evaluations_of_a_tenant_are_bounded(place: Place, transport: str) -> None:
     files = {"square.csv": walkers()}
     asked: Any = {"models": ["constant-velocity"]}
     place.quotas(evaluations=2, evaluations_active=1)

@@ -21,7 +21,6 @@ from tests.contract.servers import small_settings
 from trajectron_proto.v1 import evaluation_pb2 as epb
 from trajectron_proto.v1 import evaluation_pb2_grpc, trajectron_pb2_grpc
 from trajectron_proto.v1 import trajectron_pb2 as pb
-from trajectron_service.evaluations import jobs, queue
 from trajectron_service.lifecycle import Service, running
 from trajectron_service.tenancy import Scope
 from trajectron_service.tokens import entry, new_token
@@ -176,17 +175,8 @@ async def test_a_token_that_expires_ends_its_streams_without_being_asked(
     bob.call.cancel()
 
 
-async def test_who_watches_an_evaluation_is_shown_out_as_well(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def forever(*_: Any) -> None:
-        await asyncio.Event().wait()
-
-    async def readable(*_: Any) -> None:
-        pass
-
-    monkeypatch.setattr(queue, "carry_out", forever)
-    monkeypatch.setattr(jobs, "check_recordings", readable)
+@pytest.mark.usefixtures("endless_evaluations")
+async def test_who_watches_an_evaluation_is_shown_out_as_well(place: Place) -> None:
     form = {"evaluation": '{"evaluation_id": "night", "models": ["linear"]}'}
     async with place.http("ann") as http:
         files = [("files", ("walk.csv", CSV))]
