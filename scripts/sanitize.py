@@ -20,6 +20,7 @@ from types import ModuleType
 ROOT = Path(__file__).parents[1]
 TESTS = (
     "tests/model/test_kernel_decoding.py",
+    "tests/model/test_kernel_dense.py",
     "tests/model/test_kernel_placing.py",
     "tests/model/test_packed.py",
 )

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from scripts import sanitize
 
 pytestmark = pytest.mark.timeout(400)
 ROOT = Path(__file__).parents[2]
@@ -50,10 +51,7 @@ def sanitized(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_kernels_tests_hold_under_sanitizers() -> None:
-    kernels = ("decoding", "placing")
-    done = sanitized(
-        "tests/model/test_packed.py", *(f"tests/model/test_kernel_{name}.py" for name in kernels)
-    )
+    done = sanitized(*sanitize.TESTS)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "passed" in done.stdout
 
